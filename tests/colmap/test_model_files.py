@@ -76,17 +76,36 @@ def test_missing_file_is_named(name: str, ending: str, rigs: Path, tmp_path: Pat
         read_model(tmp_path)
 
 
-def test_name_with_blanks_in_a_text_model_is_named_with_its_line(rigs: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [pycolmap.Reconstruction.write_binary, pycolmap.Reconstruction.write_text])
+def test_names_may_hold_blanks(
+    write: Callable[[pycolmap.Reconstruction, Path], None], rigs: Path, tmp_path: Path
+) -> None:
     model = read_model(rigs)
     for image in model.images.values():
-        image.name = f"my {image.name}"
-    model.write_binary(tmp_path)
-    assert all(image.name.startswith("my ") for image in read_model(tmp_path).images.values())
-    (tmp_path / "text").mkdir()
-    model.write_text(tmp_path / "text")
-    with pytest.raises(InputError, match=r"the photo's name 'my .*' holds blanks") as caught:
-        read_model(tmp_path / "text")
-    assert (caught.value.path, caught.value.line) == (tmp_path / "text" / "images.txt", 5)
+        image.name = f"my  own {image.name}"
+    write(model, tmp_path)
+    read = read_model(tmp_path)
+    assert {id: image.name for id, image in read.images.items()} == {
+        id: image.name for id, image in model.images.items()
+    }
+    assert read.num_points3D() == model.num_points3D()
+
+
+@pytest.mark.parametrize("damage", ["cut", "nan", "commas"])
+def test_damaged_line_of_a_text_model_is_named(damage: str, rigs: Path, tmp_path: Path) -> None:
+    read_model(rigs).write_text(tmp_path)
+    lines = (tmp_path / "images.txt").read_text().split("\n")
+    number = 6 if damage == "cut" else 5
+    line = lines[number - 1]
+    words = line.split()
+    damaged = {"cut": " ".join(words[:-1]), "nan": " ".join([words[0], "nan", *words[2:]])}
+    lines[number - 1] = damaged.get(damage, line.replace(" ", ","))
+    end = number if damage == "cut" else len(lines)
+    (tmp_path / "images.txt").write_text("\n".join(lines[:end]))
+    with pytest.raises(InputError, match=r"cut off or damaged|no line of a photo") as caught:
+        read_model(tmp_path)
+    assert (caught.value.path, caught.value.line) == (tmp_path / "images.txt", number)
+    assert len(str(caught.value)) < 300
 
 
 @pytest.mark.parametrize("which", ["all", "last", "every other", "end of file"])

@@ -211,11 +211,10 @@ def damage_a_file(probe: Probe, names: tuple[str, ...]) -> None:
     if not os.path.lexists(path) or os.path.islink(path):
         return
     if path.is_dir():
-        inside = [file for file in sorted(path.rglob("*")) if file.is_file()]
         kind = probe.choose(["removed", "link", "loop", "file"])
         shutil.move(path, probe.outside / f"moved_{path.name}")
-        for file in inside:
-            probe.protected.pop(file, None)
+        for file in [file for file in probe.protected if file.is_relative_to(path)]:
+            probe.protected.pop(file)
         replace_by(probe, path, kind)
     else:
         kinds = ["cut", "emptied", "overwritten", "noise", "exchanged", "value", "value", "filled", "zeros", "tail"]

@@ -38,6 +38,8 @@ _POINT = np.dtype([("point_id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("e
 _NEEDED = ("cameras", "images", "points3D")
 # Columns before the photo's name on a line of images.txt: id, quaternion (4), translation (3), camera.
 _NUM_BEFORE_NAME = 9
+_PHOTO_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_BLANK = "\u2423"  # in the place of a blank in a photo's name
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
 # Largest difference of a quaternion's length from 1 that is corrected. Text files round quaternions, and some programs
 # write only a few digits.
@@ -239,36 +241,48 @@ def _require_whole(path: Path) -> bool:
 
 
 def _read_text_model(path: Path) -> pycolmap.Reconstruction:
-    """Read a model of text files; photos may lack the line of their features, which COLMAP needs even if it is empty.
+    """Read a model of text files.
+
+    COLMAP needs a line of features for each photo, even if it is empty, and reads names up to a blank only.
 
     Raises:
-        InputError: a photo's name holds blanks.
+        InputError: a line of images.txt is neither of a photo nor of features.
     """
-    lines = _with_feature_lines(path / "images.txt")
+    lines = _lines_for_colmap(path / "images.txt")
     if lines is None:
         return pycolmap.Reconstruction(path)
     with tempfile.TemporaryDirectory() as folder:
         for file in path.glob("*.txt"):
             shutil.copy(file, folder)
         Path(folder, "images.txt").write_text("\n".join(lines), "utf-8", "surrogateescape", "\n")
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
+    for image in model.images.values():
+        image.name = image.name.replace(_BLANK, " ")
+    return model
 
 
-def _with_feature_lines(path: Path) -> list[str] | None:
-    """Return the lines of images.txt with an empty one after each photo that has none; None if nothing is missing."""
+def _lines_for_colmap(path: Path) -> list[str] | None:
+    """Return the lines of images.txt as COLMAP can read them; None if they are so already.
+
+    A photo without a line of features gets an empty one, and blanks in its name are replaced.
+    """
     given = read_text(path, errors="surrogateescape").removesuffix("\n").split("\n")
     lines, is_whole, of_features = list[str](), True, False
     for number, line in enumerate(given, 1):
         words = line.split(maxsplit=_NUM_BEFORE_NAME)
-        is_photo = len(words) > _NUM_BEFORE_NAME and not words[0].startswith("#") and not _are_features(line)
+        is_photo = len(words) > _NUM_BEFORE_NAME and words[0].isdigit() and not _are_features(line)
         if of_features and (is_photo or line.startswith("#")):
             lines.append("")
             is_whole = False
-        if is_photo and len((name := words[-1].strip()).split()) > 1:
-            what = f"the photo's name {name!r} holds blanks, and COLMAP reads names in text files up to a blank only"
-            raise InputError(
-                f"{what}: convert the model to binary where it was made, or rename the photos", path, number
-            )
+        if is_photo:
+            if not all(map(_is_finite, words[1:-1])):
+                raise InputError(f"is no line of a photo, expected {_PHOTO_LINE}", path, number)
+            if " " in (name := words[-1].strip()):
+                line = " ".join([*words[:-1], name.replace(" ", _BLANK)])
+                is_whole = False
+        elif line.strip() and not line.startswith("#") and not (of_features and _are_features(line)):
+            expected = "x, y and the id of a point for each feature" if of_features else _PHOTO_LINE
+            raise InputError(f"is cut off or damaged, expected {expected}", path, number)
         of_features = is_photo
         lines.append(line)
     return None if is_whole and not of_features else [*lines, "", ""]
@@ -277,8 +291,12 @@ def _with_feature_lines(path: Path) -> list[str] | None:
 def _are_features(line: str) -> bool:
     """Return whether a line holds features: x, y and the id of a point for each."""
     words = line.split()
+    return len(words) % 3 == 0 and all(map(_is_finite, words))
+
+
+def _is_finite(word: str) -> bool:
     try:
-        return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
+        return math.isfinite(float(word))
     except ValueError:
         return False
 

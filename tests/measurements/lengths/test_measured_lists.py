@@ -79,11 +79,16 @@ def test_points_with_the_usual_names_may_have_decimal_commas(tmp_path: Path) -> 
     assert look_into([tmp_path]).paths == {POINTS: [path]}
 
 
+def test_a_column_may_be_called_by_its_unit_alone(tmp_path: Path) -> None:
+    tape = read_tape(write(tmp_path / "d.csv", "from,to,cm\nA,B,150\nA,C,25.5\n"))
+    assert [length.distance_m for length in tape.distances] == [1.5, 0.255]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("from;to;raw distance;mean distance\nA;B;1,5;1,5\n", "in which"),
-        ("from;to;speed\nA;B;1,5\n", "no column is from; found from, to, speed; expected from,to,distance_m"),
+        ("from;to;raw distance;mean distance\nA;B;1,5;1,5\n", "no table of taped distances; found from, to, raw"),
+        ("from;to;speed\nA;B;1,5\n", "no table of taped distances; found from, to, speed; expected from,to,distance_m"),
         ("Von;Nach;Länge [m]\nA;B;1,5\nA;C;-2\n", "d.csv:3: Länge [m] is -2, expected a number of metres"),
         ("Von;Nach;Länge [mm]\nA;B;1500\nA;C;0\n", "d.csv:3: Länge [mm] is 0, expected a number of metres"),
         ("just some words\n", "no table of taped distances, expected from,to,distance_m"),

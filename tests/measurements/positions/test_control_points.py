@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.tape_file import read_markers
 from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.control_points import ControlPoints
 from rangesfm.measurements.ranges.readers.lists import UnclearListError
@@ -97,3 +98,55 @@ def test_a_mistake_in_the_file_is_named_with_its_line(tmp_path: Path, text: str,
     with pytest.raises(InputError) as error:
         read(tmp_path, text)
     assert said in str(error.value)
+
+
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.5.0"><chunk label="Chunk 1" enabled="true">
+<cameras><camera id="3" label="IMG_1"><reference x="8" y="47" z="400"/></camera><camera id="7" label="IMG_2"/></cameras>
+<markers>
+<marker id="0" label="A"><reference x="1" y="2" z="3" sx="0.02" sy="0.02" sz="0.03" enabled="true"/></marker>
+<marker id="1" label="B"><reference x="4" y="5" z="6" enabled="false"/></marker>
+<marker id="2" label="C"/>
+</markers>
+<frames><frame id="0"><markers>
+<marker marker_id="0"><location camera_id="3" pinned="true" x="10.5" y="20"/>
+<location camera_id="7" x="11" y="21"/></marker>
+<marker marker_id="2"><location camera_id="7" x="5" y="6"/></marker>
+</markers></frame></frames>
+<reference>PROJCS["WGS 84 / UTM zone 32N",GEOGCS["x",AUTHORITY["EPSG","4326"]],AUTHORITY["EPSG","32632"]]</reference>
+</chunk></document>
+"""
+
+
+def test_markers_of_metashape_have_coordinates_and_pixels(tmp_path: Path) -> None:
+    found = read(tmp_path, METASHAPE)
+    assert [(p.name, p.stddev_m, p.kind, p.line) for p in found.points] == [
+        ("A", 0.03, "control", 5),
+        ("B", 0.01, "check", 6),
+    ]
+    np.testing.assert_array_equal(found.positions_m, [[1, 2, 3], [4, 5, 6]])
+    assert found.crs == "EPSG:32632"
+    assert {name: marker.image_names for name, marker in found.markers.items()} == {
+        "A": ("IMG_1", "IMG_2"),
+        "C": ("IMG_2",),
+    }
+    np.testing.assert_array_equal(found.markers["A"].pixels, [[10.5, 20], [11, 21]])
+    assert read_markers(tmp_path / "points.txt")["C"].lines == (12,)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ('z="3"', 'z="high"', 5, "a value is missing or no number"),
+        ('marker_id="2"', 'marker_id="9"', 12, "a value is missing or no number"),
+        ('camera_id="7" x="11"', 'camera_id="3" x="11"', 11, "marker A is twice in IMG_1"),
+        ("</chunk></document>", "</chunk><chunk/></document>", 15, "holds several chunks"),
+        ("</chunk></document>", "", 16, "no whole XML file"),
+    ],
+)
+def test_damaged_markers_of_metashape_are_named_with_their_line(
+    old: str, new: str, line: int, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=said) as refused:
+        read(tmp_path, METASHAPE.replace(old, new))
+    assert refused.value.line == line

@@ -244,6 +244,38 @@ def test_positions_of_photos_keep_their_coordinate_system(tmp_path: Path, text: 
         np.testing.assert_allclose(found.covariance_m2, np.tile(np.diag([4e-4, 4e-4, 16e-4]), (5, 1, 1)))
 
 
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "height"),
+    [
+        ("49.0398", "8.5076", "415.2"),
+        ('"49 deg 2\' 23.28"" N"', '"8 deg 30\' 27.36"" E"', "415.2 m Above Sea Level"),
+        ("49°02'23.28''N", "8°30'27.36''E", "415.2 m"),
+        ("N 49.0398°", "E 8.5076°", "415.2"),
+    ],
+)
+def test_degrees_of_photos_are_read_as_programs_write_them(
+    latitude: str, longitude: str, height: str, tmp_path: Path
+) -> None:
+    row = f"./a.jpg,{latitude},{longitude},{height}\n"
+    found = read(tmp_path, "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n" + row + row.replace("a.jpg", "b.jpg"))
+    assert (found.crs, found.image_name) == (GEOGRAPHIC, ("./a.jpg", "./b.jpg"))
+    np.testing.assert_allclose(found.position_m, 2 * [[8.5076, 49.0398, 415.2]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "Label,X/Easting,Y/Northing,Z/Altitude,X_est,Y_est,Z_est",
+        "Name,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height",
+        "Name,Easting,Northing,Elevation,Base easting,Base northing,Base elevation",
+    ],
+)
+def test_of_several_coordinates_the_measured_ones_in_the_map_are_taken(names: str, tmp_path: Path) -> None:
+    found = read(tmp_path, f"{names}\na.jpg,1,2,3,8,49,6\nb.jpg,4,5,6,8,49,6\n")
+    np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+    assert found.crs is None
+
+
 def test_columns_by_number_do_not_drop_the_coordinate_system_of_the_first_line(tmp_path: Path) -> None:
     text = "EPSG:4326\n" + by_photo("{photo} {x} {y} {z}")
     found = read(tmp_path, text, columns={"image_name": "1", "x": "2", "y": "3", "z": "4"})

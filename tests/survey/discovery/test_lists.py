@@ -131,7 +131,7 @@ ANCHOR_FILES: dict[str, tuple[str, str | bytes, dict[str, Place], str | None]] =
     "PNEZD": ("job.txt", rows("{id} {y} {x} {z} ANCHOR", LOCAL_GRID), LOCAL_GRID, "if they are north, east, height"),
     "PNEZ with commas": ("job.csv", rows("{id},{y},{x},{z}", LOCAL_GRID), LOCAL_GRID, "if they are north, east"),
     "PENZ": ("job.csv", rows("{id},{x},{y},{z}", LOCAL_GRID), LOCAL_GRID, "if the numbers are x, y, z or east"),
-    "geodetic axes": ("p.csv", "Punkt;Y;X;H\n" + rows("{id};{x};{y};{z}", comma=True), ROOM, "if x is north"),
+    "geodetic axes": ("p.csv", "Punkt;Y;X;H\n" + rows("{id};{x};{y};{z}", comma=True), ROOM, "if X is north"),
     "two ids": ("a.csv", "ID,Anchor,X,Y,Z\n" + rows("0x{n},{id},{x},{y},{z}"), ROOM, "if Anchor is the anchor's id"),
     "half a unit": ("a.csv", "Anchor,X [cm],Y,Z\n" + rows("{id},{x},{y},{z}", scale=100), ROOM, "if all are in cm"),
 }

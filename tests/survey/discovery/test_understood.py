@@ -87,7 +87,7 @@ def test_files_of_one_anchor_each_are_one_log(tmp_path: Path) -> None:
 
 def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "walk.insv").touch()
-    with pytest.raises(InputError, match="found no photos, no radio log") as caught:
+    with pytest.raises(InputError, match="found no photos, no COLMAP model") as caught:
         understand([tmp_path], {})
     assert "not used: walk.insv (extract plain photos" in caught.value.advice[0]
 
@@ -160,3 +160,33 @@ def test_a_file_about_anchors_by_its_name_that_is_not_understood_stops(tmp_path:
     (tmp_path / "corners.csv").unlink()
     (tmp_path / name).unlink()
     understand([tmp_path], {})
+
+
+def test_a_list_of_points_is_of_control_points_where_there_is_no_radio_or_the_photos_have_marks_of_them(
+    tmp_path: Path,
+) -> None:
+    write_photos(tmp_path / "images", 3)
+    points = tmp_path / "punkte.csv"
+    points.write_text("Punktnr;Rechtswert;Hochwert;Höhe\nP1;464000,1;5432000,2;400\nP2;464010;5432001;401\n")
+    assert understand([tmp_path], {})[0] == {"images.path": tmp_path / "images", "points.path": points}
+    write_log(tmp_path / "uwb.csv", 0.0)
+    assert understand([tmp_path], {})[0]["anchors.path"] == points
+    (tmp_path / "marks.csv").write_text("photo,point,x,y\nIMG_0.jpg,P1,10,20\nIMG_1.jpg,P1,11,21\n")
+    values, _ = understand([tmp_path], {})
+    assert (values["points.path"], values["scale.markers"]) == (points, tmp_path / "marks.csv")
+    assert "anchors.path" not in values
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n./IMG_{k}.jpg,49.1{k},8.2,400.5\n",
+        "Label,X/Easting,Y/Northing,Z/Altitude\nIMG_{k},46400{k},5432000,400.5\n",
+    ],
+)
+def test_a_list_of_photos_with_places_is_of_positions(text: str, tmp_path: Path) -> None:
+    write_photos(tmp_path / "images", 3)
+    header, row = text.split("\n")[:2]
+    path = tmp_path / "geotags.csv"
+    path.write_text("\n".join([header, *(row.format(k=k) for k in range(3))]))
+    assert understand([tmp_path], {})[0] == {"images.path": tmp_path / "images", "positions.path": path}

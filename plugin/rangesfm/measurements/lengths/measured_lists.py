@@ -42,7 +42,9 @@ class ListForm:
             return replace(rows, missing=MISSING)
         expected = f"expected {','.join(self.required.values())}"
         layout = layout_of_list(path, self.what, expected)
-        found = (self.find if layout.has_names else self.by_values)(layout) or {}
+        found = (self.find if layout.has_names else self.by_values)(layout)
+        if found is None:
+            raise InputError(f"no table of {self.what}; found {printable(', '.join(layout.units))}; {expected}", path)
         for quantity in self.required:
             if (num := len(those := found.get(quantity, []))) != 1:
                 which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
@@ -94,6 +96,9 @@ def _lengths_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
             of["kind"].append(column)
         else:
             others.append(column)
+    if not of["distance"]:  # a column that is called cm
+        of["distance"] = [column for column in others if column.words and {*column.words} <= terms.LENGTH_UNIT]
+        others = [column for column in others if column not in of["distance"]]
     start, end = _ends(others)
     if any(column.kind not in ("text", "nothing") for column in others if column not in (*start, *end)):
         return None  # other numbers: a log of ranges, or a list of something else

@@ -10,12 +10,13 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
+from rangesfm.measurements.lengths.metashape import MetashapeMarkers, is_metashape_file, read_metashape_markers
 from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, Tape, TapedDistance
 from rangesfm.measurements.ranges.readers.lists import ListRows
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.photo_names import photos_meant
-from rangesfm.util.files.text_tables import repeated
+from rangesfm.util.files.text_tables import read_head, repeated
 
 # Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
@@ -53,7 +54,7 @@ def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:
 
 
 def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
-    """Read ``marker,image_name,x_px,y_px``, or another table of marks in photos.
+    """Read ``marker,image_name,x_px,y_px``, another table of marks in photos, or Metashape's markers (XML).
 
     Args:
         path: the file.
@@ -62,6 +63,8 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
     Raises:
         InputError: the file is not valid; the error gives the line.
     """
+    if is_metashape_file(read_head(path)):
+        return markers_of_metashape(read_metashape_markers(Path(path)), stddev_px)
     listed = MARKS.read(Path(path))
     names, image_names = listed.text("marker"), listed.text("image_name")
     pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
@@ -74,6 +77,15 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
         if again := repeated(seen_in):
             raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
         markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
+    return markers
+
+
+def markers_of_metashape(read: MetashapeMarkers, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
+    """Return the marks in photos of Metashape's markers."""
+    markers = {}
+    for name, rows in read.seen.items():
+        photos, pixels, lines = zip(*rows, strict=True)
+        markers[name] = Marker(photos, np.array(pixels), lines, stddev_px)
     return markers
 
 

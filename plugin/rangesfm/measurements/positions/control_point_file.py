@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
 from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
-from rangesfm.measurements.lengths.tape_file import read_markers
+from rangesfm.measurements.lengths.tape_file import markers_of_metashape, read_markers
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.measurements.positions.position_log import crs_of_line
+from rangesfm.measurements.positions.position_log import crs_in_text, crs_of_line
 from rangesfm.measurements.ranges.anchors.anchor_file import find_anchor_columns, like_anchors
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import (
@@ -37,13 +38,13 @@ _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp
 
 
 def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints | None:
-    """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` or another table of points, or ODM's ``gcp_list.txt``.
+    """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` another table, ODM's ``gcp_list.txt``, or Metashape's markers.
 
     A point without a kind is a control point.
 
     Args:
         options: which name the file.
-        markers_path: file of the marks in photos; None: those of ``gcp_list.txt``, or printed tags.
+        markers_path: file of the marks in photos; None: those of ``gcp_list.txt`` or Metashape, or printed tags.
 
     Raises:
         UnclearListError: the columns are not known for sure; the advice says what to type.
@@ -54,7 +55,7 @@ def read_control_points(options: PointOptions, markers_path: Path | None) -> Con
         return None
     head = read_head(path)
     markers = {} if markers_path is None else read_markers(markers_path)
-    read = _gcp_list if is_gcp_list(head) else _table
+    read = _gcp_list if is_gcp_list(head) else _metashape if is_metashape_file(head) else _table
     found = replace(read(path, options, head), markers_path=markers_path)
     return found.with_more(markers)
 
@@ -147,6 +148,19 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
         marks.setdefault(name, []).append((image_name, numbers[3:], line))
     markers = {name: _marker(name, seen, path) for name, seen in marks.items()}
     return ControlPoints(tuple(points.values()), markers, False, crs, path)
+
+
+def _metashape(path: Path, options: PointOptions, _head: str) -> ControlPoints:
+    """Read Metashape's markers; those whose coordinates are not enabled are check points, as there."""
+    read = read_metashape_markers(path)
+    points = tuple(
+        ControlPoint(name, np.array(place), stddev or options.stddev_m, CONTROL if is_enabled else CHECK, line)
+        for name, (place, stddev, is_enabled, line) in read.places.items()
+    )
+    if not points:
+        raise InputError("its markers have no coordinates: give them in another file, and this one by --markers", path)
+    are_stated = all(stddev for _, stddev, _, _ in read.places.values())
+    return ControlPoints(points, markers_of_metashape(read), are_stated, crs_in_text(read.system), path)
 
 
 def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:

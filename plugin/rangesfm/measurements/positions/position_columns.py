@@ -17,7 +17,13 @@ from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising, named_photos
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout
-from rangesfm.measurements.ranges.readers.lists import AXES, Choice, UnclearListError, columns_flag
+from rangesfm.measurements.ranges.readers.lists import (
+    AXES,
+    Choice,
+    UnclearListError,
+    columns_flag,
+    coordinates_of_point,
+)
 
 STDDEVS = tuple(f"stddev_{axis}" for axis in AXES)
 COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
@@ -73,7 +79,8 @@ def _labels(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
 def _axes_by_name(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
     """Find x, y, z by their names; else return the columns that they may be, by the case in which they are."""
     numbers = [column for column in free if column.kind == "numbers"]
-    of_axis = {axis: [column.name for column in numbers if _is_axis(column, axis)] for axis in AXES}
+    may_be = {axis: [column for column in numbers if _is_axis(column, axis)] for axis in AXES}
+    of_axis = {axis: [column.name for column in coordinates_of_point(those)] for axis, those in may_be.items()}
     groups = [*_triples(numbers)]
     if all(len(those) == 1 for those in of_axis.values()):
         found.columns |= {axis: those[0] for axis, those in of_axis.items()}

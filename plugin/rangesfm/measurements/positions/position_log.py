@@ -33,10 +33,15 @@ def crs_in_head(head: str) -> str | None:
     for line in head.split("\n"):
         if line.strip() and not line.lstrip().startswith("#"):
             return crs_of_line(line)
-        # The number at the end of a long text (WKT) is that of the whole system.
-        if numbers := _EPSG.findall(line):
-            return f"EPSG:{numbers[-1]}"
+        if crs := crs_in_text(line):
+            return crs
     return None
+
+
+def crs_in_text(text: str) -> str | None:
+    """Return the coordinate system of a text by its number; that at the end of WKT is that of the whole system."""
+    numbers = _EPSG.findall(text)
+    return f"EPSG:{numbers[-1]}" if numbers else None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,9 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.imu.formats import is_imu_log
 from rangesfm.measurements.imu.signals import kind_of_file
 from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
+from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
 from rangesfm.measurements.positions.control_point_file import is_point_file
+from rangesfm.measurements.positions.position_columns import find_position_columns, is_degrees
 from rangesfm.measurements.positions.position_formats import is_of_positions
 from rangesfm.measurements.ranges.anchors import anchor_file
 from rangesfm.measurements.ranges.errors.error_curve import is_error_curve_file
@@ -33,13 +35,15 @@ from rangesfm.survey.sources.bag import has_images
 from rangesfm.survey.sources.source import is_video
 from rangesfm.util.files.bags import is_bag, is_bag_folder
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
-from rangesfm.util.files.text_tables import has_columns, read_head
+from rangesfm.util.files.text_tables import has_columns, header_names, read_head
 from rangesfm.util.geometry.reference import is_reference_file
 
 PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
 POINTS, POSITIONS, REFERENCE, IMU = "points.path", "positions.path", "report.reference", "imu.path"
 # Words in the name of a file whose positions are measured, not true ones to compare with.
-_MEASURED = frozenset({"position", "positions", "gps", "gnss", "rtk", "ppk", "pozyx", "marvelmind"})
+_MEASURED = frozenset(
+    "position positions positionen gps gnss rtk ppk geotag geotags exif pozyx marvelmind".split()  # noqa: SIM905
+)
 _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
@@ -135,7 +139,7 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
                 elif not has_photos:
                     unused[_UNKNOWN].append(path)
         except UnclearListError as error:
-            unclear[ANCHORS if error.what == anchor_file.WHAT else TIMES].append(error)
+            unclear[{anchor_file.WHAT: ANCHORS, "positions": POSITIONS}.get(error.what, TIMES)].append(error)
         except InputError as error:
             if error.advice:
                 unsure[path] = error
@@ -146,7 +150,7 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
         tables = [path for path in (*unsure, *unused[_UNKNOWN]) if path.suffix.lower() in _TABLE_EXTENSIONS]
         if those := [asked for path in tables if (asked := anchor_file.like_anchors(path)) is not None]:
             unclear[ANCHORS] = those
-        like_anchors = {path: why for why, those in unused.items() for path in those if _is_about_anchors(path)}
+        like_anchors = {path: why for why, those in unused.items() for path in those if is_about_anchors(path)}
     if LOG not in paths:
         for path in [*unsure][:_MAX_NUM_UNSURE]:
             notes.append(f"{unsure.pop(path)}; if it is the radio's log, rangesfm ranges {path} says what is missing")
@@ -170,15 +174,17 @@ def _listed(paths: Sequence[Path], folders: Sequence[Path]) -> str:
     return f"{', '.join(names[:_MAX_NUM_NAMED])} and {len(names) - _MAX_NUM_NAMED} more ({endings})"
 
 
-def _is_about_anchors(path: Path) -> bool:
-    """Return whether a table or drawing is about anchors by its name."""
-    is_list = path.suffix.lower() in (*_TABLE_EXTENSIONS, *_NOT_READ)
-    return is_list and not ABOUT_ANCHORS.isdisjoint(words_of(path.stem))
+def is_about_anchors(path: Path) -> bool:
+    """Return whether a table or drawing is about anchors by its name, or by the names of its columns."""
+    is_table = path.suffix.lower() in _TABLE_EXTENSIONS
+    names = [path.stem, *(header_names(read_head(path)) if is_table else ())]
+    return (is_table or path.suffix.lower() in _NOT_READ) and any(ABOUT_ANCHORS & {*words_of(name)} for name in names)
 
 
 def _reason_by_name(path: Path) -> str | None:
     """Return why a file is not used, if its name already says so."""
-    if path.suffix.lower() in _NOT_READ and not path.is_dir():
+    is_read = path.suffix.lower() == ".xml" and is_metashape_file(read_head(path))
+    if path.suffix.lower() in _NOT_READ and not path.is_dir() and not is_read:
         return _NOT_READ[path.suffix.lower()]
     if path.suffix.lower() in IMAGE_EXTENSIONS and not path.is_dir():
         return f"a folder of photos has {MIN_NUM_PHOTOS} or more"
@@ -198,6 +204,8 @@ def _key_of(path: Path) -> str | None:
     head = read_head(path)
     if not head.strip() or "\0" in head:
         return IMU if is_imu_log(path) else None
+    if is_metashape_file(head):
+        return POINTS if read_metashape_markers(path).places else "scale.markers"
     if LENGTHS.is_such(path):  # between photos it could be read as a log that names photos
         return "scale.distances"
     if MARKS.is_such(path):
@@ -224,13 +232,37 @@ def _key_of(path: Path) -> str | None:
     if is_imu_log(path):
         return IMU
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
-        return POSITIONS if key == REFERENCE and not _MEASURED.isdisjoint(words_of(path.stem)) else key
+        return _measured_or_true(path) if key == REFERENCE else key
     with nullcontext() if is_table else suppress(UnclearListError):
-        if key := _list_of(path):
+        if key := _list_of(path) or _positions_of(path):
             return key
     if unsure.advice and is_table:
         raise unsure
     return None
+
+
+def _measured_or_true(path: Path) -> str:
+    """Return the key of a file of positions: measured ones by the name of the file, or true ones to compare with."""
+    return REFERENCE if _MEASURED.isdisjoint(words_of(path.stem)) else POSITIONS
+
+
+def _positions_of(path: Path) -> str | None:
+    """Return the key for a table of the camera's positions by photo or time; None if it is none.
+
+    Raises:
+        UnclearListError: it holds places on the Earth, or of photos, and the columns are not known for sure.
+    """
+    layout = find_layout(path)
+    if layout is None or not layout.has_names:
+        return None
+    on_earth = all(any(is_degrees(column.name, axis) for column in layout.columns) for axis in ("x", "y"))
+    try:
+        find_position_columns(path, layout)
+    except UnclearListError:
+        if on_earth:
+            raise
+        return None
+    return POSITIONS if on_earth else _measured_or_true(path)
 
 
 def _list_of(path: Path) -> str | None:

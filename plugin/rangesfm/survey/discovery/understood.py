@@ -15,7 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.tape_file import read_markers
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.measurements.ranges.readers.lists import UnclearListError
 from rangesfm.sfm.image_times import list_images
@@ -29,6 +31,7 @@ from rangesfm.survey.discovery.found_files import (
     POINTS,
     POSITIONS,
     Found,
+    is_about_anchors,
     look_into,
     short_path,
 )
@@ -72,6 +75,7 @@ def understand(
     roles = {item.dotted: item.role for item in KEYS}
     values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
     found = look_into(folders, {path for path in values.values() if isinstance(path, Path)})
+    _tell_points_from_anchors(found, values)
     notes, questions = list(found.notes), []
     for item in KEYS:
         key, paths = item.dotted, found.paths.get(item.dotted, [])
@@ -116,11 +120,50 @@ def understand(
         for path in found.models
         if path != values.get(MODEL)
     ]
-    if not {PHOTOS, *METRIC_KEYS} & values.keys():
-        raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
+    if not {PHOTOS, MODEL, *METRIC_KEYS} & values.keys():
+        found_none = "found no photos, no COLMAP model and nothing that was measured in it"
+        raise InputError(found_none, folders[0], advice=notes)
     _add_camera(values, found, notes)
     _add_exif_positions(values, notes)
     return values, notes
+
+
+def _tell_points_from_anchors(found: Found, values: Mapping[str, Any]) -> None:
+    """Move lists of points that are no anchors, but control points or positions of the camera.
+
+    They are control points if the photos have marks of them, or if there is no radio and they are not called anchors.
+    They are positions if they are named like the photos.
+    """
+    has_log = LOG in {*values, *found.paths}
+    photos = {Path(name).stem.lower() for folder in found.paths.get(PHOTOS, []) for name in _names_of_photos(folder)}
+    marks = {name for path in found.paths.get("scale.markers", []) for name in _names_of_marks(path)}
+    for path in found.paths.pop(ANCHORS, []):
+        ids: set[str] = set()
+        with suppress(InputError):  # rangesfm check reports it
+            ids = {anchor.anchor_id for anchor in read_anchors(path)}
+        if ids and {Path(name).stem.lower() for name in ids} <= photos:
+            key = POSITIONS
+        else:
+            key = POINTS if ids & marks or not (has_log or is_about_anchors(path)) else ANCHORS
+        found.paths.setdefault(key, []).append(path)
+    if len(points := found.paths.get(POINTS, [])) > 1 or POINTS in values:  # Metashape's markers have marks as well
+        found.paths.setdefault("scale.markers", []).extend(path for path in points if path.suffix.lower() == ".xml")
+        found.paths[POINTS] = [path for path in points if path.suffix.lower() != ".xml"]
+    for error in found.unclear.pop(ANCHORS, []):
+        if has_log or is_about_anchors(Path(error.path or "")):
+            found.unclear.setdefault(ANCHORS, []).append(error)
+        else:
+            as_points = error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"})
+            found.unclear.setdefault(POINTS, []).append(as_points)
+
+
+def _names_of_photos(folder: Path) -> Sequence[str]:
+    return () if is_source(folder) else list_images(folder)
+
+
+def _names_of_marks(path: Path) -> Iterator[str]:
+    with suppress(InputError):
+        yield from read_markers(path)
 
 
 def _questions(

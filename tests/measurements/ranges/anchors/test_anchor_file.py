@@ -339,8 +339,8 @@ def test_y_before_x_is_asked_about_because_surveyors_call_north_x(tmp_path: Path
     doubts, choices = doubts_about(table(tmp_path, f"Point,{y},{x},{z}/A,1,2,3"))
     assert doubts == f"not sure: {y} comes before {x}, as where surveyors call north x"
     assert choices == {
-        "if x is north": f"--anchor_columns anchor_id=Point,x={y},y={x},z={z}",
-        "if x is east and y is north": f"--anchor_columns anchor_id=Point,x={x},y={y},z={z}",
+        f"if {x} is north": f"--anchor_columns anchor_id=Point,x={y},y={x},z={z}",
+        f"if {x} is east and {y} is north": f"--anchor_columns anchor_id=Point,x={x},y={y},z={z}",
     }
 
 

@@ -19,6 +19,7 @@ from rangesfm.measurements.ranges.readers.lists import (
     UnclearListError,
     columns_by_user,
     columns_flag,
+    coordinates_of_point,
     layout_of_list,
     read_canonical_rows,
     read_rows,
@@ -120,7 +121,9 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     is_about_anchors = not terms.ABOUT_ANCHORS.isdisjoint(terms.words_of(path.stem))
     is_named = layout.has_names and any((terms.ANCHOR | terms.POINT) & {*column.words} for column in ids)
     num_axes = sum(map(bool, axes.values()))
-    may_be = bool(ids) and (num_axes == 3 or (is_named and (num_axes == 2 or bool(degrees))))
+    may_be = bool(ids) and (
+        num_axes == 3 or (is_named and num_axes == 2) or (bool(degrees) and bool(is_named or axes["z"]))
+    )
     if _is_of_times(layout, ids) or not (may_be or (is_about_anchors and _has_numbers(layout))):
         return None
     columns = {quantity: those[0].name for quantity, those in found.items() if those}
@@ -193,11 +196,13 @@ def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
     found: dict[str, list[ColumnSample]] = {quantity: [] for quantity in QUANTITIES}
     others = list[ColumnSample]()
     for column in layout.columns:
-        quantity = _named_quantity({*column.words})
+        quantity = None if column.names_photos else _named_quantity({*column.words})
         (found[quantity] if quantity else others).append(column)
     found["anchor_id"] = by_id_rather_than_index(found["anchor_id"])
+    found |= {axis: coordinates_of_point(found[axis]) for axis in AXES}
     if not found["anchor_id"] and all(found[axis] for axis in AXES):
         texts = [column for column in others if column.kind == "text" and column.num_distinct == len(column.cells)]
+        texts = [column for column in texts if not column.names_photos]
         nameless = [column for column in layout.columns[:1] if column.name == "column 1"]
         found["anchor_id"] = nameless or (texts if len(texts) == 1 else [])
     return found
@@ -263,7 +268,6 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     order = [column.name for column in layout.columns]
     x, y = columns["x"], columns["y"]
     swapped = {**columns, "x": y, "y": x}
-    east_first, north_first = _choice("if x is east and y is north", columns), _choice("if x is north", swapped)
     if not layout.has_names:
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
@@ -272,7 +276,8 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
             second = _choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]
     elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
-        yield f"{y} comes before {x}, as where surveyors call north x", [north_first, east_first]
+        choices = [_choice(f"if {x} is north", swapped), _choice(f"if {x} is east and {y} is north", columns)]
+        yield f"{y} comes before {x}, as where surveyors call north x", choices
     units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
     if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})

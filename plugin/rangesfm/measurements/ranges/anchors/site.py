@@ -48,10 +48,10 @@ class Site:
             InputError: only one of the site and the coordinates has a coordinate system.
         """
         if (crs is None) != (self.georeference is None):
-            which = ("these coordinates", "the anchors") if crs else ("the anchors", "these coordinates")
-            raise InputError(
-                f"{which[0]} have a coordinate system and {which[1]} have none, expected both or none", path
-            )
+            which = ["these coordinates", "those of the anchors or control points"]
+            has, lacks = which if crs else reversed(which)
+            advice = "give it, such as EPSG:2056, by --anchor_crs, --point_crs or --position_crs"
+            raise InputError(f"{has} have a coordinate system and {lacks} have none, expected both: {advice}", path)
         if crs is None or self.georeference is None:
             return coordinates - self.offset_m
         return self.georeference.local(coordinates, crs)

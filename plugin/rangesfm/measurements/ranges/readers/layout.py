@@ -22,6 +22,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.readers.angles import spelt_angle
 from rangesfm.measurements.ranges.readers.gsi import gsi_records, is_gsi
 from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
 from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
@@ -50,7 +51,8 @@ _THOUSANDS = {
     "'\u2019 \xa0\u202f": re.compile(r"[-+]?\d{1,3}(?:['\u2019 \xa0\u202f]\d{3})+(?:[.,]\d+)?", re.ASCII),
 }
 _GROUPED = re.compile(r"[-+]?\d[\d,.'\u2019 \xa0\u202f]*", re.ASCII)
-_WITH_UNIT = re.compile(rf"({_DECIMAL_COMMA.pattern}|{_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
+# Exiftool prints heights as 415.2 m Above Sea Level.
+_WITH_UNIT = re.compile(rf"({_DECIMAL_COMMA.pattern}|{_NUMBER.pattern}) ?([A-Za-z]+)(?: Above Sea Level)?", re.ASCII)
 _DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
 _UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
@@ -72,16 +74,20 @@ class Cure:
         thousands: characters that set thousands apart, which are removed; "" if there are none.
         commas: whether numbers have decimal commas.
         are_dates: whether the cells are dates in another form than 2026-01-31.
+        are_angles: whether the cells are degrees, minutes and seconds.
     """
 
     unit: str = ""
     thousands: str = ""
     commas: bool = False
     are_dates: bool = False
+    are_angles: bool = False
 
     def __call__(self, cell: str) -> str:
         if self.are_dates:
             return spelt_date(cell) or cell
+        if self.are_angles:
+            return cell if (angle := spelt_angle(cell)) is None else f"{angle:.12g}"
         found = _WITH_UNIT.fullmatch(cell) if self.unit else None
         number = found[1] if found and found[2] == self.unit else cell
         if self.thousands and _GROUPED.fullmatch(number):
@@ -151,6 +157,8 @@ class ColumnSample:
         """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
         if self.filled and all(map(spelt_date, self.filled)):
             return self._with(Cure(are_dates=True))
+        if self.filled and not any(spelt_angle(cell) is None for cell in self.filled):
+            return self._with(Cure(are_angles=True))
         units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
         unit = next(iter(units)) if len(units) == 1 else ""
         cure = Cure(unit if unit.lower() in _UNITS else "")

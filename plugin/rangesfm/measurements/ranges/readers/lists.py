@@ -17,8 +17,9 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
+from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import MISSING, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import MISSING, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE, named_length_unit
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.text_tables import FOUND, NO_NAMES, TextTable, read_head, read_table
@@ -130,6 +131,18 @@ def columns_by_user(
         expected = f"{', '.join(required[:-1])} and {required[-1]}"
         raise InputError(f"columns do not name {', '.join(missing)}, expected {expected}", path)
     return {quantity: given[quantity] for quantity in quantities if quantity in given}
+
+
+def coordinates_of_point(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
+    """Return, of the columns that may be one coordinate, those of the measured point itself, as it is in the map.
+
+    A table may have estimated coordinates beside these, those of the base station, and those on the ellipsoid.
+    """
+    # Alone in a name, est is east in French.
+    kept = [one for one in columns if terms.ESTIMATED.isdisjoint(one.words) or {*one.words} <= terms.ESTIMATED]
+    for others in (terms.BASE, terms.ELLIPSOIDAL):
+        kept = [one for one in kept or columns if others.isdisjoint(one.words)] or [*(kept or columns)]
+    return kept
 
 
 @dataclass(frozen=True)

@@ -116,8 +116,12 @@ DEGREES = {
 }
 BESIDE_COORDINATE = LENGTH_UNIT | _words(
     "coord coords coordinate coordinates koordinate coordonnée coordenada coordinata coördinaat pos position value "
-    "wert local"
+    "wert local gps gnss rtk"
 )
+# Words in the names of further coordinates of a point: estimated ones, and those of the base station.
+ESTIMATED = _words("est estimated")
+BASE = _words("base")
+ELLIPSOIDAL = _words("ell ellipsoidal").union(*DEGREES.values())
 # Words in the names of triples that are no positions: turns, velocities, accelerations, biases.
 NO_POSITION = _words(
     "q quat quaternion orientation rotation rot v vel velocity twist linear angular a acc accel acceleration w omega "
@@ -127,7 +131,7 @@ NO_POSITION = _words(
 QUALITY = _words("quality qual fix q qf")
 BESIDE_QUALITY = _words("gps gnss position pos solution factor indicator")
 LINKING = _words("de du des del di der van of the")
-STDDEV = _words("stddev stdev std sigma sd uncertainty accuracy genauigkeit standardabweichung")
+STDDEV = _words("stddev stdev std sigma sd rms uncertainty accuracy genauigkeit standardabweichung")
 BIAS = _words("bias offset")
 PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
 FILE = _words("file filename filenames name names path datei dateiname fichier nom source sourcefile archivo")
