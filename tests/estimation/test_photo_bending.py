@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.model import SyntheticModel, random_similarity, synthetic_model
 from tests.simulated.path import loop_path
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import MapBending, WalkBending
@@ -53,6 +54,28 @@ def test_a_mappers_model_is_at_the_minimum_of_its_photos_and_a_refined_map_need_
     elsewhere = replace(bending, is_at_optimum=False).of_functions(by_pose, frame_is_free=True)
     assert np.abs(elsewhere.shift_m).max() > 1e-4
     np.testing.assert_allclose(elsewhere.formal_m2, at_minimum.formal_m2)
+
+
+@pytest.mark.parametrize("frame_is_free", [True, False])
+def test_likely_steps_are_to_the_photos_minimum_and_then_as_far_as_the_covariance_lets_a_pull(
+    frame_is_free: bool,
+) -> None:
+    turn = random_similarity(np.random.default_rng(3))
+    model = rescale(simulated(pixel_stddev=1.0).reconstruction, turn)
+    bending = bending_of(model)
+    assert isinstance(bending, PhotoBending)
+    bending = replace(bending, is_at_optimum=False)
+    by_pose, pull = along_x(bending.path), np.random.default_rng(4).normal(size=NUM)
+
+    def moved(pulls: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+        turns, shifts_m = bending.likely_steps(pulls, 3.0, frame_is_free=frame_is_free).at(bending.frame_ids)
+        in_model = shifts_m @ bending.world_from_model / bending.metres_per_unit
+        return np.asarray(by_pose @ np.hstack([turns, in_model]).ravel())
+
+    expected = bending.of_functions(by_pose, frame_is_free=frame_is_free)
+    unmoved = moved(np.zeros(6 * NUM))
+    np.testing.assert_allclose(unmoved, expected.shift_m, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(moved(pull @ by_pose) - unmoved, 9.0 * expected.formal_m2 @ pull, rtol=1e-6, atol=1e-9)
 
 
 def test_twice_the_noise_bends_twice_as_far() -> None:

@@ -20,7 +20,7 @@ from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations, ScaleUncertainty
 from rangesfm.survey import kinds_in_map
 from rangesfm.survey.kinds_in_map import MapOfPhotos
-from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import Similarity, align_points
 
 STEPS, STEPS_STDDEV_M = "steps", 0.02
 SAID = "a step counter does not know how long a step is"
@@ -100,8 +100,8 @@ def refined(
     model = pycolmap.Reconstruction(out / "sparse_metric" / "0")
     centers_m = {image.name: image.projection_center() for image in model.images.values()}
     path_m = np.array([centers_m[name] for name in survey.image_names])
-    lengths_m = [float(np.linalg.norm(np.diff(at_m, axis=0), axis=1).sum()) for at_m in (path_m, survey.centers_m)]
-    return json.loads((out / "result.json").read_text(encoding="utf-8")), lengths_m[0] / lengths_m[1] - 1
+    too_large = align_points(survey.centers_m, path_m).scale - 1
+    return json.loads((out / "result.json").read_text(encoding="utf-8")), too_large
 
 
 @pytest.mark.parametrize("flags", [("--anchor_frame", "unknown"), ("--anchors", "anchors.csv")])

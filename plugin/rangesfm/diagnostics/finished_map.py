@@ -17,7 +17,7 @@ from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.measurements.joint_map import Doubt, moves_as_a_whole
+from rangesfm.measurements.joint_map import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
@@ -109,9 +109,6 @@ def place_of_map(
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     if found is not None:
         of_keyframes = found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
-        # Some kinds have moved the map as a whole to where the best weights for errors that last have it.
-        is_moved = estimate.on_map is not None and moves_as_a_whole(estimate.on_map.kinds)
-        of_map = of_map if is_moved else found.similarity
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))

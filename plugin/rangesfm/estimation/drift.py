@@ -18,6 +18,7 @@ from rangesfm.estimation.vision_information import (
     Observations,
     VisionInformation,
     costs_of_points,
+    model_observations,
     photo_gradient,
     project,
     ray_residuals,
@@ -26,6 +27,7 @@ from rangesfm.estimation.vision_information import (
     vision_information,
 )
 from rangesfm.measurements.kind import Block, MapState
+from rangesfm.solver.bending import FrameSteps
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.util.geometry.poses import Poses, model_poses
 from rangesfm.util.geometry.robust_statistics import wider
@@ -213,6 +215,14 @@ def _solve_precisely(graph: KeyframeGraph, problem: MapProblem, start: MapState)
 def _bend(before: Array, after: Array) -> float:
     """Return the root mean square distance that no similarity explains; 0 for fewer than three keyframes."""
     return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
+
+
+def bend(metric: pycolmap.Reconstruction, steps: FrameSteps) -> None:
+    """Move frames of a model by steps, in place, and its points with them."""
+    frame_ids = np.array(sorted(metric.reg_frame_ids()), dtype=np.int64)
+    before, (turns, shifts_m) = model_poses(metric, frame_ids), steps.at(frame_ids)
+    after = Poses(before.world_from_rig @ Rotation.from_rotvec(turns).as_matrix(), before.centers + shifts_m)
+    carry_model(metric, frame_ids, model_observations(metric, frame_ids), before, after, np.ones(len(frame_ids)))
 
 
 def carry_model(

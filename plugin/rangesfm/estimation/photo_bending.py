@@ -12,12 +12,17 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.vision_information import misplaced_points, model_observations
+from rangesfm.measurements.joint_map import JointMap
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import (
+    NO_STEPS,
     Bending,
+    FrameSteps,
     MapBending,
     WalkBending,
     bending_part,
+    motions_of_poses,
+    similarity_of,
     without_similarity,
 )
 from rangesfm.solver.bundle_adjustment import bundle_adjustment
@@ -67,6 +72,29 @@ class PhotoBending:
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
         return Bending(() if found is None else (found,), covariance, shift_m)
 
+    def likely_steps(self, pull: Array, factor: float, *, frame_is_free: bool) -> FrameSteps:
+        """Return the steps to where the map is likeliest bent, without a change of its size and its place as a whole.
+
+        Args:
+            pull: (6 k,) sum over all observations of their derivatives by the poses, times the inverse covariance of
+                what the estimate leaves of them, measured minus predicted.
+            factor: learnt bending over that expected from the photos. frame_is_free: as in ``of_functions``.
+        """
+        of_path = similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
+        motions = motions_of_poses(self.path.world_from_cam, self.path.centers - self.path.centers[0]).reshape(-1, 7)
+        parts = (factor**2 * (pull - (pull @ motions) @ of_path)).reshape(-1, 6)
+        by_center = parts[:, 3:] @ self.world_from_model.T / self.metres_per_unit
+        frame_ids, poses = self.photos.poses
+        steps = self.photos.likely_steps(self.frame_ids, parts[:, :3], by_center)
+        found = FrameSteps(frame_ids, steps[:, :3], steps[:, 3:])
+        turns, shifts_m = found.at(self.frame_ids)
+        whole = of_path @ np.hstack([turns, shifts_m @ self.world_from_model / self.metres_per_unit]).ravel()
+        whole[1:4] = self.world_from_model @ whole[1:4]
+        whole[4:] = self.metres_per_unit * self.world_from_model @ whole[4:]
+        first = poses.centers[np.searchsorted(frame_ids, self.frame_ids[0])]
+        back = motions_of_poses(poses.world_from_rig, poses.centers - first) @ whole
+        return FrameSteps(frame_ids, found.turns - back[:, :3], found.shifts_m - back[:, 3:])
+
     def hold_together(self, image_names: Collection[str]) -> bool:
         """Return whether the photos determine the scale of a part of the map relative to the rest.
 
@@ -80,6 +108,20 @@ class PhotoBending:
             by_pose[part, 3:] = sign * off / np.sum(off**2)
         covariance = self.of_functions(by_pose.reshape(1, -1), frame_is_free=True).formal_m2
         return bool(covariance[0, 0] < _HELD**2)
+
+
+def likely_bend(at_rest: JointMap) -> FrameSteps:
+    """Return where photos and all that is measured have the frames of a map at rest, before it moves as a whole.
+
+    It is their expected bending after all that is observed: Rasmussen and Williams, "Gaussian processes for machine
+    learning", 2006, eq. 2.42. A map whose photos say nothing of it stays as it is.
+    """
+    problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
+    if not isinstance(bending, PhotoBending):
+        return NO_STEPS
+    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
+    is_free = known.columns.frame >= 0
+    return bending.likely_steps(known.pulls @ by_pose, problem.bending_factor, frame_is_free=is_free)
 
 
 def bending_of_model(

@@ -17,7 +17,7 @@ from scipy import special
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.source import Source
-from rangesfm.solver.bending import MapBending
+from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
 from rangesfm.solver.posterior import (
@@ -61,9 +61,6 @@ class KindOnMap(Located):
 
     is_solved: ClassVar[bool] = False
     """Whether they were solved with unknowns of their own, so that a map with them is linear about their solution."""
-    fit_places_map: ClassVar[bool] = False
-    """Whether a map at rest keeps the place of its fit, whose covariance is then the place's. Else it is moved as a
-    whole to the best estimate, as for errors that last, which the fit does not know."""
 
     notes: tuple[str, ...] = ()
     """What is said of them whatever becomes of the map, in words."""
@@ -147,9 +144,9 @@ class KindOnMap(Located):
         del on_map
         return self
 
-    def moved(self, known: Posterior) -> Self:
-        """Return them on the map that was moved to the estimate of a posterior."""
-        del known
+    def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> Self:
+        """Return them on the map that was bent by steps, and then moved as a whole to the estimate of a posterior."""
+        del known, bent
         return self
 
     def posterior(self, problem: JointProblem) -> Posterior:
@@ -263,9 +260,9 @@ class JointMap:
         """Return the map with what it says of each kind."""
         return replace(self, kinds=tuple(kind.concluded(self) for kind in self.kinds))
 
-    def moved(self) -> tuple[KindOnMap, ...]:
-        """Return the kinds on the map that was moved to its estimate."""
-        return tuple(kind.moved(self.posterior) for kind in self.kinds)
+    def moved(self, bent: FrameSteps = NO_STEPS) -> tuple[KindOnMap, ...]:
+        """Return the kinds on the map that was bent by steps of its frames, and moved to its estimate."""
+        return tuple(kind.moved(self.posterior, bent) for kind in self.kinds)
 
 
 def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second: ScaleByKind) -> MistakeTest:
@@ -292,11 +289,6 @@ def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second:
 def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:
     """Return the measurements of a kind among all; None without any."""
     return next((each for each in kinds if isinstance(each, kind)), None)
-
-
-def moves_as_a_whole(kinds: Sequence[KindOnMap]) -> bool:
-    """Return whether any that place a map at rest move it as a whole, away from the place of its fit."""
-    return any(each.is_used and each.places_map and not each.fit_places_map for each in kinds)
 
 
 def observations(
@@ -344,10 +336,6 @@ def join_kinds(
     problem = joined(found, bending).learnt()
     if is_at_rest:
         known = problem.posterior(is_refined=True)
-        if known.columns.frame >= 0 and not moves_as_a_whole(kinds):
-            known = known.keeping_place(
-                (placed.scale * (path.centers - path.centers[0])).mean(axis=0) @ placed.rotation.T
-            )
     else:
         known = used[0].posterior(problem) if len(used) == 1 else problem.posterior()
     observed = {each.kind: each for each in found}

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array
-from rangesfm.colmap.pieces import LoosePiece, loose_pieces
+from rangesfm.arrays import Array, Indices
+from rangesfm.colmap.pieces import LoosePiece, frames_of_largest_part, loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import (
@@ -22,8 +22,9 @@ from rangesfm.diagnostics.finished_map import (
 from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.drift import bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
-from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
+from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos, likely_bend
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
@@ -62,7 +63,7 @@ from rangesfm.pipeline.close_loops import RefinedMap, close_loops_of_survey
 from rangesfm.pipeline.join_models import ModelVerdict, join_models
 from rangesfm.pipeline.metric_result import MetricResult, Rivals
 from rangesfm.result.result_folder import is_refined_model
-from rangesfm.solver.bending import MapBending, WalkBending
+from rangesfm.solver.bending import FrameSteps, MapBending, WalkBending
 from rangesfm.solver.mistakes import MistakeTests
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, sources_in_map
@@ -471,14 +472,19 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
+def _metres_per_unit(unscaled: Trajectory, path: Trajectory, firm_ids: Indices) -> float:
+    """Return the scale of the similarity that fits the centres of the firm frames of two paths best."""
+    is_firm = np.isin(path.frame_ids, firm_ids)
+    return align_points(unscaled.centers[is_firm], path.centers[is_firm]).scale
+
+
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
     """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
     start, model = metric.estimate.on_map, rest.problem.metric
     if start is None:
         return None
     path = metric.trajectory.as_in(model)
-    is_firm = np.isin(path.frame_ids, rest.firm_ids)
-    scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
+    scale = _metres_per_unit(metric.trajectory, path, rest.firm_ids)
     bending = _bending_at_rest(rest, path, scale)
     inputs = replace(run.inputs, tape=metric.tape, positions=metric.positions)
     of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
@@ -572,13 +578,29 @@ def _tested_without_ranges(
 
 
 def _moved(metric: MetricResult, at: JointMap) -> MetricResult:
-    """Return the result with the refined map moved as a whole to its estimate."""
-    refinement, before, after = metric.kept_refinement, at.find(RangeScale), find_kind(at.moved(), RangeScale)
+    """Return the result with the refined map bent and moved as a whole to its best estimate."""
+    bent = _likely_bend(metric, at)
+    refinement, before, after = metric.kept_refinement, at.find(RangeScale), find_kind(at.moved(bent), RangeScale)
     assert metric.refined is not None, "a refined map"
     if before is not None and after is not None and refinement is not None:
         longer_m, state = after.predicted_m - before.predicted_m, after.solution.fit.state
         refinement = refinement.moved(at.estimate, state.anchors_m, after.posed.rows, longer_m)
-    return replace(metric, refined=rescale(metric.refined, at.estimate), refinement=refinement)
+    refined = pycolmap.Reconstruction(metric.refined)
+    if len(bent.frame_ids):
+        bend(refined, bent)
+    return replace(metric, refined=rescale(refined, at.estimate), refinement=refinement)
+
+
+def _likely_bend(metric: MetricResult, at: JointMap) -> FrameSteps:
+    """Return the steps of ``likely_bend`` with the scale of the similarity to the unscaled model left as it is."""
+    assert metric.refined is not None, "a refined map"
+    bent, path, unscaled = likely_bend(at), at.path, metric.trajectory
+    if not len(bent.frame_ids):
+        return bent
+    bent_m, centers_m = path.centers + bent.at(path.frame_ids)[1], model_poses(metric.refined, bent.frame_ids).centers
+    scale = _metres_per_unit(unscaled, replace(path, centers=bent_m), frames_of_largest_part(metric.refined))
+    first_m, size = path.centers[0], at.metres_per_unit / scale
+    return bent._replace(shifts_m=first_m + size * (centers_m + bent.shifts_m - first_m) - centers_m)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:

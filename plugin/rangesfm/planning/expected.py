@@ -106,7 +106,7 @@ class Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
-        known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(0))
+        known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(0), np.zeros(0))
         open_m = np.full(len(planned.trajectory), np.inf)
         return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal)
 

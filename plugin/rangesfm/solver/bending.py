@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -57,6 +57,28 @@ class Bending:
     shift_m: Array
 
 
+class FrameSteps(NamedTuple):
+    """Steps of m frames of a map from where they are.
+
+    Attributes:
+        frame_ids: (m,). turns: (m, 3) in the frames' own axes, radians. shifts_m: (m, 3) in the map's world, metres.
+    """
+
+    frame_ids: Indices
+    turns: Array
+    shifts_m: Array
+
+    def at(self, frame_ids: Indices) -> tuple[Array, Array]:
+        """Return the turns (k, 3) and shifts (k, 3) of some frames; 0 for those that make none."""
+        turns, shifts_m = np.zeros((2, len(frame_ids), 3))
+        _, row, own = np.intersect1d(frame_ids, self.frame_ids, return_indices=True)
+        turns[row], shifts_m[row] = self.turns[own], self.shifts_m[own]
+        return turns, shifts_m
+
+
+NO_STEPS = FrameSteps(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
 class MapBending(Protocol):
     """Prior knowledge of how a map is bent."""
 
@@ -99,6 +121,12 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool,
             anywhere, and would make size and place of the whole map as uncertain.
     """
     motions = _motions(path)
+    return np.asarray(by_pose - (by_pose @ motions) @ similarity_of(path, frame_is_free=frame_is_free, is_firm=is_firm))
+
+
+def similarity_of(path: Trajectory, *, frame_is_free: bool, is_firm: Mask | None = None) -> Array:
+    """Return the (7, 6 k) derivatives of the similarity of a path by its poses; arguments as above."""
+    motions = _motions(path)
     counts = np.ones(len(path)) if is_firm is None else is_firm
     weights = np.outer(counts, np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3)).ravel()
     weighted = motions * weights[:, None]
@@ -108,15 +136,23 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool,
         of_poses[1:] = 0.0
         of_poses[1:4, :3] = path.world_from_cam[0]
         of_poses[4:, 3:6] = np.eye(3)
-    return np.asarray(by_pose - (by_pose @ motions) @ of_poses)
+    return np.asarray(of_poses)
+
+
+def motions_of_poses(world_from_rig: Array, from_origin: Array) -> Array:
+    """Return the (n, 6, 7) motions of poses by the logarithm of the scale, a turn and a shift about an origin.
+
+    Args:
+        world_from_rig: (n, 3, 3). from_origin: (n, 3) their centres.
+    """
+    motions = np.zeros((len(from_origin), 6, 7))
+    motions[:, :3, 1:4] = np.swapaxes(world_from_rig, 1, 2)
+    motions[:, 3:] = similarity_motions(from_origin)
+    return motions
 
 
 def _motions(path: Trajectory) -> Array:
-    """Return the (6 k, 7) motions of poses by the logarithm of the scale, a turn and a shift about the first pose."""
-    motions = np.zeros((len(path), 6, 7))
-    motions[:, :3, 1:4] = np.swapaxes(path.world_from_cam, 1, 2)
-    motions[:, 3:] = similarity_motions(path.centers - path.centers[0])
-    return motions.reshape(-1, 7)
+    return motions_of_poses(path.world_from_cam, path.centers - path.centers[0]).reshape(-1, 7)
 
 
 def _size(path: Trajectory) -> float:

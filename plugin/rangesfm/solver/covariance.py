@@ -17,6 +17,7 @@ from rangesfm.solver.normal_equations import HALF_A_REVOLUTION, BlockColumns, No
 from rangesfm.solver.part_errors import PartSteps, map_errors
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.numerics import UNDETERMINED
+from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.rotations import cross_matrices
 from rangesfm.util.geometry.similarity import similarity_motions
 
@@ -176,17 +177,45 @@ class PhotosAlone:
         Returns:
             (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
         """
-        columns, gradients = self._columns, np.zeros((len(self._gradient), len(by_turn)))
-        pose_of_frame = dict(zip(columns.frames.tolist(), columns.poses, strict=True))
-        for k, frame_id in enumerate(frame_ids.tolist()):
-            pose = pose_of_frame[frame_id]
-            if (index := columns.index_of.get(address(pose))) is not None:
-                # Ceres turns on the left of the rotation, and by twice its step.
-                by_step = by_center[:, k] @ _center_from_step(pose)
-                by_step[:, :3] -= 2.0 * by_turn[:, k]
-                gradients[columns.span(index)] = by_step.T
+        gradients = np.zeros((len(self._gradient), len(by_turn)))
+        for frame_id, pose, rows in self._free_poses():
+            for k in np.flatnonzero(frame_ids == frame_id):
+                gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T
         solution = self._inverse.solve(gradients)
         return self._stddev**2 * gradients.T @ solution, -solution.T @ self._gradient
+
+    def likely_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
+        """Return where the frames are likeliest to be, as (m, 6) steps of ``poses``; 0 for those that are held.
+
+        A step is a turn of the rig in its own frame, and a shift of its origin.
+
+        Args:
+            frame_ids: (k,). by_turn, by_center: (k, 3) pull of what was measured on them: minus the derivatives, as of
+                ``of_functions``, of half its sum of squares.
+        """
+        pulls = np.zeros(len(self._gradient))
+        for frame_id, pose, rows in self._free_poses():
+            for k in np.flatnonzero(frame_ids == frame_id):
+                pulls[rows] = np.append(by_turn[k], by_center[k]) @ _pose_from_step(pose)
+        solution = self._inverse.solve(np.column_stack([self._stddev**2 * pulls, -self._gradient])).sum(axis=1)
+        steps = np.zeros((len(self._columns.frames), 6))
+        for frame_id, pose, rows in self._free_poses():
+            steps[self._columns.frames == frame_id] = _pose_from_step(pose) @ solution[rows]
+        return steps
+
+    @property
+    def poses(self) -> tuple[Indices, Poses]:
+        """Ids (m,) and poses of the frames, in the model's world."""
+        turns = np.array([rotation_of(pose).T for pose in self._columns.poses])
+        shifts = np.array([pose[4:] for pose in self._columns.poses])
+        return self._columns.frames, Poses(turns, -np.einsum("mij,mj->mi", turns, shifts))
+
+    def _free_poses(self) -> Iterator[tuple[int, Array, slice]]:
+        """Yield the id, the pose and the rows in the equations of each frame that is not held."""
+        columns = self._columns
+        for frame_id, pose in zip(columns.frames.tolist(), columns.poses, strict=True):
+            if (index := columns.index_of.get(address(pose))) is not None:
+                yield frame_id, pose, columns.span(index)
 
 
 @dataclass(frozen=True)
@@ -375,3 +404,8 @@ def _center_from_step(pose: Array) -> Array:
     """Return the (3, 6) derivative of the centre -R^T t by a step in Ceres' tangent space, which turns by twice it."""
     rotation = rotation_of(pose)
     return -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
+
+
+def _pose_from_step(pose: Array) -> Array:
+    """Return the (6, 6) derivatives, by a step in that space, of the rig's turn in its own frame and of its centre."""
+    return np.vstack([np.eye(3, 6) * -2.0, _center_from_step(pose)])

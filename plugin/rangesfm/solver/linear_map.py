@@ -163,6 +163,11 @@ class Solved:
         return np.asarray(-self._gains @ whitened)
 
     @property
+    def pulls(self) -> Array:
+        """(c,) inverse covariance times what the unknowns leave of the observations, measured minus predicted."""
+        return np.asarray(-solve_triangular(self.lower, self.residual[: len(self.lower)], lower=True, trans=1))
+
+    @property
     def gains(self) -> tuple[Array, Array]:
         """(p, c) and (p, r) change of the estimate per unit of each measurement and prior."""
         num = len(self.lower)

@@ -112,6 +112,7 @@ class Posterior:
         columns: the p unknowns. covariance: (p, p) of these.
         step: (p,) from the state at which the map is to the estimate, to which everything else refers.
         gains: (c,) change of the scale's logarithm per metre of each observation that is used.
+        pulls: (c,) inverse covariance times what the estimate leaves of each, measured minus predicted.
     """
 
     uncertainty: ScaleUncertainty
@@ -119,6 +120,7 @@ class Posterior:
     covariance: Array
     step: Array
     gains: Array
+    pulls: Array
 
     @property
     def placement(self) -> Array | None:
@@ -130,17 +132,6 @@ class Posterior:
         """(7, 7) the same covariance, of a map that is placed."""
         assert self.placement is not None, "the map is placed"
         return self.placement
-
-    def keeping_place(self, middle_m: Array) -> Posterior:
-        """Return the posterior with an estimate to which the map only changes its size.
-
-        Args:
-            middle_m: (3,) of the map, which stays where it is, from the first camera in the site's axes.
-        """
-        step, of_map = np.zeros_like(self.step), self.columns.of_map
-        step[of_map[0]] = self.step[of_map[0]]
-        step[of_map[4:]] = -step[of_map[0]] * middle_m
-        return replace(self, step=step)
 
     @classmethod
     def best(cls, linear: LinearMap, noise: Noise, formal: float) -> Posterior:
@@ -155,7 +146,7 @@ class Posterior:
         if (given := float(np.linalg.norm(of_priors[0]))) > 0:
             components[GIVEN] = given
         uncertainty = ScaleUncertainty(formal, components)
-        return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0])
+        return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0], best.pulls)
 
 
 @dataclass(frozen=True)

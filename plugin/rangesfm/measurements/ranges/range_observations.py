@@ -48,6 +48,11 @@ class OnPath:
     after: Indices
     fraction: Array
 
+    @property
+    def nearest(self) -> Indices:
+        """Index of the nearest keyframe (n,)."""
+        return np.where(self.fraction < 0.5, self.before, self.after)
+
 
 @dataclass(frozen=True)
 class RangeObservations:

@@ -107,23 +107,12 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
 
 def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
     """Return the ranges moved along from one path to another."""
-    at, problem = on_map.on_path, on_map.problem
-    moved = after.path.centers - before.path.centers
-    turned = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
-    turn = turned[np.where(at.fraction < 0.5, at.before, at.after)]
-    share = at.fraction[:, None]
-
-    def turned_by(vectors: Array) -> Array:
-        return np.asarray(np.einsum("nij,nj->ni", turn, vectors))
-
+    at, turned = on_map.on_path, after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
+    turn = turned[at.nearest]
     return replace(
         on_map,
-        problem=replace(
-            problem,
-            centers=problem.centers + (1 - share) * moved[at.before] + share * moved[at.after],
-            tag_from_center=turned_by(problem.tag_from_center),
-        ),
+        problem=on_map.problem.carried(at, turned, after.path.centers - before.path.centers),
         model_from_cam=turn @ on_map.model_from_cam,
-        velocity=None if on_map.velocity is None else turned_by(on_map.velocity),
+        velocity=None if on_map.velocity is None else np.einsum("nij,nj->ni", turn, on_map.velocity),
         bending=after,
     )

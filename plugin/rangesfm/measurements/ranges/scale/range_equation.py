@@ -23,6 +23,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.errors.noise import bias_whitening
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.solver.linear_map import Columns
 from rangesfm.util.geometry.gravity import Gravity
@@ -72,6 +73,20 @@ class RangeProblem:
     @property
     def num_anchors(self) -> int:
         return len(self.anchor_stddev_m)
+
+    def carried(self, on_path: OnPath, turns: Array, shifts: Array) -> RangeProblem:
+        """Return the ranges on a path that was bent.
+
+        Args:
+            on_path: their places on it. turns, shifts: (k, 3, 3) and (k, 3) of its keyframes, in the model's world.
+        """
+        at, share = on_path, on_path.fraction[:, None]
+        turn = turns[at.nearest]
+        return replace(
+            self,
+            centers=self.centers + (1 - share) * shifts[at.before] + share * shifts[at.after],
+            tag_from_center=np.einsum("nij,nj->ni", turn, self.tag_from_center),
+        )
 
     @cached_property
     def uncertain(self) -> tuple[Indices, Indices]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, Located, join_kinds, upward_by
@@ -38,7 +39,7 @@ from rangesfm.measurements.ranges.scale.solution import (
     with_unknown_anchors,
 )
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.solver.bending import MapBending
+from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
@@ -66,7 +67,7 @@ class RangeScale(KindOnMap):
 
     kind = words = RANGES
     method = "robust"
-    fit_places_map = is_solved = True
+    is_solved = True
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
 
     @property
@@ -130,9 +131,15 @@ class RangeScale(KindOnMap):
         """Return what they say of the map, which is where their robust weights have it."""
         return problem.posterior(formal=self.solution.fit.log_scale_stddev)
 
-    def moved(self, known: Posterior) -> RangeScale:
-        """Return the ranges on the map at the estimate of a posterior, with the same robust weights."""
-        return replace(self, solution=moved(self.solution, known))
+    def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
+        """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
+        turns, shifts_m = bent.at(self.path.frame_ids)
+        first_from_world = self.path.world_from_cam[0].T
+        in_first = Rotation.from_rotvec(np.einsum("ij,kjl,kl->ki", first_from_world, self.path.world_from_cam, turns))
+        on_path, problem = self.posed.observations.on_path(self.posed.rows), self.solution.problem
+        shifts = self.unit * shifts_m @ first_from_world.T
+        carried = replace(self.solution, problem=problem.carried(on_path, in_first.as_matrix(), shifts))
+        return replace(self, solution=moved(carried, known))
 
     def concluded(self, on_map: JointMap) -> RangeScale:
         """Return the ranges with what the whole map says of them."""
