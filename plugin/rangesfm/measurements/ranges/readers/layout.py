@@ -143,7 +143,8 @@ class ColumnSample:
 
     @cached_property
     def is_whole(self) -> bool:
-        return self.kind == "numbers" and bool(np.all(self.numbers == np.round(self.numbers)))
+        """Whether it holds whole numbers, of which at least one has a size with which one can calculate."""
+        return len(self.numbers) > 0 and self.kind == "numbers" and bool(np.all(self.numbers == np.round(self.numbers)))
 
     @cached_property
     def num_distinct(self) -> int:
