@@ -161,11 +161,12 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module or folder and its line in the table; no stage has to know of it."""
     assert {f"measurements.{kind}.cost" for kind in ("ranges", "lengths", "positions")} <= KINDS
     knowing = {(module, name) for module in MODULES.keys() - KINDS for name in own_imports(module) & KINDS}
-    # What is of ranges alone, and a plan of positions.
+    # What is of ranges alone, and plans of positions and of a sensor.
     of_ranges = {f"estimation.scale.{name}" for name in ("initialize", "scale_estimate", "bent_estimate")}
     of_ranges |= {"estimation.with_ranges", "pipeline.make_metric_map", "diagnostics.finished_map"}
     of_one_kind = {name for name in MODULES if name.startswith(("measurements.ranges.", "measurements.positions."))}
-    assert {module for module, _ in knowing} <= {"survey.kinds_in_map", "planning.expected", *of_ranges, *of_one_kind}
+    plans = {"planning.expected", "planning.planned_sensor"}
+    assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *plans, *of_ranges, *of_one_kind}
     logs = {"measurements.ranges.radio", "measurements.positions.site_positions"}  # several kinds are in one log
     others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}
     assert not {(module, name) for module, name in others if module.split(".")[1] != name.split(".")[1]}

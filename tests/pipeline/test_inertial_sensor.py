@@ -16,6 +16,8 @@ from tests.simulated.inertial import Motion, by_hand, imu_log, photos
 from tests.simulated.surveys import Place, model_of_poses
 
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS
+from rangesfm.pipeline.plan_again import plan_of_result
+from rangesfm.planning.expected import expect
 
 OFFSET_S = 3.25
 METRES_PER_UNIT = 1 / 0.37
@@ -78,6 +80,8 @@ def test_photos_and_a_sensor_make_a_metric_and_level_map(
     down = np.array(imu["gravity_in_world"]) / np.linalg.norm(imu["gravity_in_world"])
     assert np.degrees(np.arccos(-down @ up)) < 0.5
     assert imu["up_stddev_deg"] < 0.5
+    again = expect(plan_of_result(tmp_path / "out"))  # its map bends as usual, which is more than this one
+    assert half_width(result) < again.uncertainty.half_width_95 < 3 * half_width(result)
     assert "samples of an inertial sensor give it metres" in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 

@@ -7,10 +7,11 @@ with an accelerometer whose axes are off by 3 % (1 stddev). Time offset and rota
 about one axis, is given. The photos' path bends by 0.2 % of its size. A mistake is drawn at random and put into a
 survey by hand with a phone; it is named if the message, a warning or a doubt has its word.
 
-Prints for each kind of survey in how many the true scale is in its 95 % interval, the median half width, the root mean
-square of the errors of scale and vertical in stated standard deviations, and in how many the verdict says that the
-motion does not show the scale. Exit status 1 if fewer than 93 % of all are covered, if a rover is not told whose scale
-is known to no better than 4 %, or if fewer than nine in ten mistakes are named.
+Prints for each kind of survey in how many the true scale is in its 95 % interval, the median half width, that of a plan
+(`rangesfm plan`, whose maps bend as usual, and not as little as these), the root mean square of the errors of scale and
+vertical in stated standard deviations, and in how many the verdict says that the motion does not show the scale. Exit
+status 1 if fewer than 93 % of all are covered, if a rover is not told whose scale is known to no better than 4 %, or if
+fewer than nine in ten mistakes are named.
 """
 
 from __future__ import annotations
@@ -45,9 +46,10 @@ from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.sensor import InertialSensor
+from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 MOTIONS: dict[str, Callable[[int], Motion]] = {
     "hand": by_hand,
@@ -60,12 +62,13 @@ EVENLY = "moved too evenly"
 
 
 class Found(NamedTuple):
-    """What a survey gave: errors of scale and vertical in stated stddevs, half of the interval, and what is told."""
+    """What a survey gave: errors of scale and vertical in stddevs, half of the interval, what is told, and as planned."""
 
     scale: float
     vertical: float
     half_width: float
     told: str
+    planned: float = np.nan
 
 
 def made(motion: Motion, grade: Grade, seed: int) -> tuple[ImuLog, Trajectory]:
@@ -77,12 +80,14 @@ def located(sensor: InertialSensor, path: Trajectory) -> tuple[InertialScale, st
     """Return the sensor on the map, as a run finds it, and the warnings."""
     aligned = sensor.aligned_with(path)
     assert aligned.alignment is not None
-    found = scale_by_sensor(InertialProblem.of_sensor(aligned, aligned.alignment, path), WalkBending(path))
+    found = scale_by_sensor(
+        InertialProblem.of_sensor(aligned, aligned.alignment, path), WalkBending(in_first_camera(path))
+    )
     return found, "; ".join(aligned.alignment.mistakes)
 
 
-def surveyed(motion: Motion, grade: Grade, seed: int) -> Found:
-    log, path = made(motion, grade, seed)
+def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
+    log, path = made(motion, GRADES[of_grade], seed)
     assert path.timestamps_s is not None
     try:
         given = CAM_FROM_IMU if motion.amplitudes_rad[:2].max() < 0.05 else None
@@ -96,7 +101,11 @@ def surveyed(motion: Motion, grade: Grade, seed: int) -> Found:
     away = found.upward.up_in_first_camera - path.world_from_cam[0].T @ upward
     doubts = told_by(found)
     tilt = float(np.linalg.norm(away)) / np.sqrt(2) / found.upward.stddev_rad
-    return Found(off, tilt, known.uncertainty.half_width_95, "; ".join([told, *doubts]))
+    turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
+    path = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
+    planned = PlannedSensor(grade=of_grade).on_map(path, WalkBending(in_first_camera(path))).alone  # type: ignore[arg-type]
+    widths = known.uncertainty.half_width_95, planned.uncertainty.half_width_95
+    return Found(off, tilt, widths[0], "; ".join([told, *doubts]), widths[1])
 
 
 def told_by(found: InertialScale) -> list[str]:
@@ -190,8 +199,8 @@ def main() -> int:
     args = parser.parse_args()
     all_covered, rovers_told = [], []
     for name, motion in MOTIONS.items():
-        for of_grade, grade in GRADES.items():
-            found = [surveyed(motion(args.seed + k), grade, args.seed + k) for k in range(args.num_seeds)]
+        for of_grade in GRADES:
+            found = [surveyed(motion(args.seed + k), of_grade, args.seed + k) for k in range(args.num_seeds)]
             known = [each for each in found if np.isfinite(each.half_width)]
             errors = np.array([[each.scale, each.vertical] for each in known]).reshape(-1, 2)
             covered = np.abs(errors[:, 0]) <= 1.96
@@ -200,10 +209,13 @@ def main() -> int:
             if name == "rover":
                 rovers_told += [is_told or each.half_width <= 0.04 for is_told, each in zip(told, found, strict=True)]
             rms_scale, rms_tilt = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else (np.nan, np.nan)
-            half = 100 * float(np.median([each.half_width for each in known])) if known else np.nan
+            half, planned = 100 * np.median(
+                [[each.half_width, each.planned] for each in known] or [[np.nan] * 2], axis=0
+            )
             print(
-                f"{name:6} {of_grade:9} covered {covered.sum()} of {len(known)}, half width {half:.2g} %, errors in "
-                f"stddevs {rms_scale:.2f} (scale) {rms_tilt:.2f} (vertical), told {sum(told)} of {len(found)}",
+                f"{name:6} {of_grade:9} covered {covered.sum()} of {len(known)}, half width {half:.2g} % (planned "
+                f"{planned:.2g} %), errors in stddevs {rms_scale:.2f} (scale) {rms_tilt:.2f} (vertical), told "
+                f"{sum(told)} of {len(found)}",
                 flush=True,
             )
             for each in found:

@@ -19,6 +19,7 @@ from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
@@ -41,30 +42,33 @@ _BEHIND_M = 0.05
 def plan_of_result(path: AnyPath) -> PlannedSurvey:
     """Return the plan of a survey with the path, the anchors and the number of ranges of a finished one.
 
-    Path and anchors are those of the result's map, and the errors of the radio are those that the run has learnt. For a
-    map in the frame of the first camera, up is the mean upward direction of the photos.
+    Path and anchors are those of the result's map, and the errors of radio and inertial sensor are those that the run
+    has learnt. For a map in the frame of the first camera, up is as measured, or the mean upward direction of photos.
 
     Raises:
-        InputError: the folder is not a result, or has no metric model or no used ranges.
+        InputError: the folder is not a result, or has no metric model, or neither used ranges nor an inertial sensor.
     """
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
-    if model is None or ranges is None or not ranges.is_used.any():
+    used, imu = () if ranges is None else np.array(ranges.anchor_id, dtype=str)[ranges.is_used], folder.summary.imu
+    if model is None or (not len(used) and imu is None):
         raise InputError("has no metric model or no used ranges, expected a finished result", path)
     trajectory = path_in_result(model, folder)
     if not is_one_after_the_other(trajectory):
         expected = "expected the result of one survey"
         raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)
-    used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
-    (arm,) = folder.lever_arms_m(ranges.tag_id[:1])
+    sensor = None if imu is None else PlannedSensor(gyro_noise=imu.gyro_noise, accel_noise=imu.accel_noise)
+    (arm,) = np.zeros((1, 3)) if ranges is None else folder.lever_arms_m(ranges.tag_id[:1])
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
-    heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used.tolist())}
+    heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used)}
     anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
     is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
     frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
-    on_earth = folder.summary.georeference
+    on_earth, upward = folder.summary.georeference, None if folder.summary.up is None else folder.summary.up[0]
     site = Site(georeference=None if on_earth is None else on_earth.georeference)
-    return _planned(trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m, site)
+    return _planned(
+        trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m, site, sensor, upward
+    )
 
 
 def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georeference | None) -> MetricResult:
@@ -97,7 +101,12 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georefe
         stddevs = {} if learned is None else learned.stddev_of_component
         points_m = colored_points(metric.final)[0]
         site = Site(georeference=georeference)
-        planned = _planned(trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs, site)
+        learnt = {} if metric.all_measured is None else metric.all_measured.problem.sizes
+        noise = learnt.get("gyro_noise"), learnt.get("accel_noise")
+        sensor = PlannedSensor(gyro_noise=noise[0], accel_noise=noise[1]) if all(noise) else None
+        planned = _planned(
+            trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs, site, sensor, metric.upward
+        )
         expected = expect(planned)
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
@@ -116,14 +125,16 @@ def _planned(
     num_ranges: int,
     component_stddevs: Mapping[str, float],
     site: Site,
+    sensor: PlannedSensor | None = None,
+    upward: Array | None = None,
 ) -> PlannedSurvey:
     """Return the plan with z up, inside what the photos show, and with assumed times where the photos have none.
 
     Args:
-        points_m: (n, 3) points of the map.
+        points_m: (n, 3) points of the map. upward: (3,) unit vector in it, as measured; None: the photos tell it.
     """
     is_site = frame == "site"
-    level = np.eye(3) if is_site else level_axes(trajectory, up_in_world(trajectory, "auto"))
+    level = np.eye(3) if is_site else level_axes(trajectory, up_in_world(trajectory, "auto", upward))
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
     planned = PlannedSurvey(
         trajectory=replace(trajectory.transformed(1.0, level, np.zeros(3)), timestamps_s=times),
@@ -132,11 +143,13 @@ def _planned(
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
+        sensor=sensor,
+        times_are_known=trajectory.timestamps_s is not None,
         site=site if is_site else Site(),
         axes="" if is_site else _AXES,
         level="" if is_site else _LEVEL,
     )
-    return _inside(planned.ranging(num_ranges), points_m @ level.T)
+    return _inside(planned.ranging(num_ranges) if anchors else planned, points_m @ level.T)
 
 
 def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.preflight import SAME_PLACE_M
@@ -24,6 +25,7 @@ from rangesfm.planning.paths import NUM_WAVES, way_along
 from rangesfm.planning.placement import LEAST_GAIN, spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.planning.walls import AT_WALL_M, lead_through
 from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -34,6 +36,8 @@ _RAISED_M = (1.0, -1.0, 2.0, -2.0)
 _CARRIED_M = 3.0
 # Amplitude, metres, of a path that goes up and down.
 _UP_AND_DOWN_M = 0.5
+# Angle, degrees, by which a camera is tilted up, down and to the sides, so that gravity shows the scale of all axes.
+_TILTED_DEG = 20.0
 # Factor by which a path or the anchors are spread out.
 _WIDER = 1.5
 # Standard deviation of the radio's error curve after a calibration, metres.
@@ -181,10 +185,19 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         for factor in _MORE_OFTEN:
             often = replace(planned, rate_hz=factor * planned.rate_hz)
             yield "rate", "", f"range {factor} times as often", often
+    if planned.sensor is None and planned.times_are_known:
+        sensor, with_sensor = (
+            "record the inertial sensor of a phone on the camera",
+            replace(planned, sensor=PlannedSensor()),
+        )
+        yield "inertial sensor", "", sensor, with_sensor
+    if planned.sensor is not None:
+        tilt = f"tilt the camera up, down and to the sides on the way, by {_TILTED_DEG:g} degrees, {NUM_WAVES} times"
+        yield "tilted camera", "", tilt, replace(planned, trajectory=_tilted(path))
     yield from _with_control_points(planned)
     length_m, stddev_m = _TAPED_M
     tape = f"tape a length of {length_m:g} m to {1000 * stddev_m:g} mm between two points of the map"
-    if planned.anchors:
+    if planned.anchors or planned.sensor is not None:
         yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
 
 
@@ -302,6 +315,14 @@ def _up_and_down(path: Trajectory) -> Trajectory:
     way = way_along(path.centers)
     wave = _UP_AND_DOWN_M * np.sin(2 * np.pi * NUM_WAVES * way / max(float(way[-1]), 1e-9))
     return replace(path, centers=path.centers + wave[:, None] * [0.0, 0.0, 1.0])
+
+
+def _tilted(path: Trajectory) -> Trajectory:
+    """Return a path on which the camera looks up and down, and leans to both sides in between."""
+    way = way_along(path.centers)
+    phase = 2 * np.pi * NUM_WAVES * way / max(float(way[-1]), 1e-9)
+    tilts = Rotation.from_euler("xz", _TILTED_DEG * np.column_stack([np.sin(phase), np.cos(phase)]), degrees=True)
+    return replace(path, world_from_cam=path.world_from_cam @ tilts.as_matrix())
 
 
 def _bent(path: Trajectory) -> tuple[Trajectory, float]:

@@ -32,6 +32,7 @@ from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
 from rangesfm.options import LENGTH_M, ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_sensor import PlannedScale
 from rangesfm.solver.bending import BENDS, MapBending, WalkBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
@@ -43,6 +44,7 @@ from rangesfm.solver.posterior import (
     ScaleUncertainty,
     joined,
 )
+from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import similarity_motions
 from rangesfm.util.geometry.trajectory import in_first_camera
 
@@ -87,7 +89,8 @@ class Expected:
         keyframe_stddevs_m: (n,) roots of the summed variances of each keyframe's position in the result's frame, after
             ranges and known positions have straightened the map; inf if not determined.
         num_positions: number of known positions that hold the map.
-        notes: why known positions are not used, in words.
+        notes: why known positions or the inertial sensor are not used, in words.
+        sensor: the inertial sensor on the true map; None without one.
         refusal: why a run will find nothing at all; empty if it will.
     """
 
@@ -99,6 +102,7 @@ class Expected:
     keyframe_stddevs_m: Array
     num_positions: int
     notes: tuple[str, ...]
+    sensor: PlannedScale | None = None
     refusal: str = ""
 
     @classmethod
@@ -108,7 +112,7 @@ class Expected:
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
         known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(0), np.zeros(0))
         open_m = np.full(len(planned.trajectory), np.inf)
-        return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal)
+        return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal=refusal)
 
     @property
     def uncertainty(self) -> ScaleUncertainty:
@@ -129,12 +133,19 @@ class Expected:
         """
         if self.refusal:
             raise GeometryError(self.refusal)
-        if self.ranges is None:
+        if self.ranges is None and self.sensor is not None and not self.num_positions:
+            doubts = self.sensor.doubts(self.uncertainty)
+        elif self.ranges is None:
             has_check = any(point.kind == CHECK for point in self.planned.points)
             doubts = doubts_of_positions(self.num_positions, self.uncertainty, has_check=has_check)
         else:
             doubts = doubts_of_ranges(self.ranges.posed, self.ranges.solution, self.uncertainty, {})
         return judge(doubts, (), self.uncertainty, ScaleOptions())
+
+    @property
+    def gravity(self) -> Gravity | None:
+        """The upward direction in the first camera, as the inertial sensor tells it; None without one."""
+        return None if self.sensor is None else self.sensor.upward
 
     def mirror_image(self) -> str | None:
         """Return why the run will leave the position open, or None if it will not.
@@ -149,7 +160,8 @@ class Expected:
         try:
             # For a path in that plane the height is not determined, and the solver divides 0 by 0.
             with np.errstate(invalid="ignore", divide="ignore"):
-                solution = solution_from(self.planned.posed(self.turned_out(0)), self.ranges.solution.fit.state)
+                posed = self.planned.posed(self.turned_out(0), gravity=self.gravity)
+                solution = solution_from(posed, self.ranges.solution.fit.state)
                 refuse_ambiguity(solution, [mirrored], None)
         except GeometryError as error:
             return str(error)
@@ -232,15 +244,21 @@ def expect(
     first = in_first_camera(path)
     the_map = _BendingMap(planned, WalkBending(first) if vision is None else GraphBending(vision, first), num_keyframes)
     positions, placement, notes = _positions(planned, the_map, max_num_bins)
-    ranges = _ranges(planned, placement, max_num_bins) if planned.anchors else None
+    sensor, why_not = _sensor(planned, the_map)
+    gravity = None if sensor is None or not planned.anchors else sensor.upward
+    ranges = _ranges(planned, placement, gravity, max_num_bins) if planned.anchors else None
     observed: list[Observations] = [] if ranges is None else [ranges.observed]
     observed += [] if positions is None else [positions]
     if planned.taped:
         observed.append(lengths_on_map(planned.taped_lengths, 1.0, path, np.ones(len(planned.taped), dtype=bool)))
+    if sensor is not None:
+        most = max_num_bins // 2 if observed else max_num_bins
+        observed.append(sensor.observed(sensor.start, in_site=placement is not None, max_num=most))
     problem, known, keyframe_stddevs_m = the_map.solved(observed)
     learned = None if ranges is None else LearnedErrors.from_noise(problem.noise_of(RANGES), ranges.observed.bins)
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
-    return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes)
+    notes = (*notes, *why_not)
+    return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes, sensor)
 
 
 def _positions(
@@ -262,8 +280,22 @@ def _positions(
     return found, PlacementPrior.with_covariance(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
 
 
-def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bins: int) -> RangesAtTruth:
-    posed = planned.posed(planned.observations(), placement)
+def _sensor(planned: PlannedSurvey, the_map: _BendingMap) -> tuple[PlannedScale | None, tuple[str, ...]]:
+    """Return the inertial sensor on the map, and why it is not used."""
+    if planned.sensor is None:
+        return None, ()
+    try:
+        return planned.sensor.on_map(planned.trajectory, the_map.bending), ()
+    except GeometryError as error:
+        if not (planned.anchors or planned.points or planned.antenna):
+            raise
+        return None, (f"the inertial sensor is not used: {error}",)
+
+
+def _ranges(
+    planned: PlannedSurvey, placement: PlacementPrior | None, gravity: Gravity | None, max_num_bins: int
+) -> RangesAtTruth:
+    posed = planned.posed(planned.observations(), placement, gravity)
     state = planned.state(posed)
     tags, scale = antenna_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
     errors = posed.errors.at(tags, posed.placing_stddev_m(scale))
@@ -271,7 +303,7 @@ def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bi
     weights = np.full(len(posed.rows), float(planned.num_alike))
     solution = Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
     found = binned_ranges(posed, solution, max_num_bins=max_num_bins, noise_m=START_STDDEV_M)
-    sizes = _given_or_usual(found.components, planned.component_stddevs)
+    sizes = _given_or_usual(found.components, planned.given_sizes)
     alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
     return RangesAtTruth(posed, solution, replace(found, alone_m2=alone))
 
@@ -310,7 +342,7 @@ class _BendingMap:
 
     def _sizes(self, components: Sequence[Component], num_first: int) -> dict[str, float]:
         """Return the sizes of all components; what is given of the bending refers to the first observations."""
-        given = dict(self.planned.component_stddevs)
+        given = dict(self.planned.given_sizes)
         for each in components:
             if each.name in BENDS and each.name in given:
                 given[each.name] /= float(np.sqrt(np.trace(each.alike[:num_first, :num_first]) / num_first))

@@ -24,6 +24,7 @@ from rangesfm.planning.placement import places_in_box, places_on_walls, spread_a
 from rangesfm.planning.plan_checks import oddities, require_possible
 from rangesfm.planning.planned import Coordinate, Place, PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
+from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -146,9 +147,10 @@ PLAN_TABLES: dict[str, type[Options]] = {
     "photos": PlannedPhotos,
     "points": PlannedPointOptions,
     "positions": PlannedAntenna,
+    "imu": PlannedSensor,
 }
 # Tables that say nothing where they are missing.
-_OPTIONAL_TABLES = ("photos", "points", "positions")
+_OPTIONAL_TABLES = ("photos", "points", "positions", "imu")
 
 
 def read_plan(path: AnyPath) -> PlannedSurvey:
@@ -213,6 +215,7 @@ def _planned(
     photos: PlannedPhotos | None = None,
     points: PlannedPointOptions | None = None,
     positions: PlannedAntenna | None = None,
+    imu: PlannedSensor | None = None,
 ) -> PlannedSurvey:
     if tag.lever_arms_m:
         raise tag.refused("lever_arms_m", "is given, expected tag_in_cam_m: a plan has one tag")
@@ -221,12 +224,13 @@ def _planned(
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
         raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
     has_positions = points is not None or positions is not None
+    has_others = has_positions or imu is not None
     if has_positions and anchors.frame == "first_camera":
         raise anchors.refused("frame", "is 'first_camera', expected site or unknown beside [points] and [positions]")
     allowed_m = _allowed(anchors)
     planned = PlannedSurvey(
         trajectory=_path(path),
-        anchors=() if has_positions and not anchors.model_fields_set else _anchors(anchors, allowed_m),
+        anchors=() if has_others and not anchors.model_fields_set else _anchors(anchors, allowed_m),
         anchor_frame=anchors.frame,
         rate_hz=radio.rate_hz,
         tag_in_cam_m=tag.tag_in_cam_m,
@@ -236,6 +240,7 @@ def _planned(
         photos=photos,
         points=() if points is None else _points(points),
         antenna=positions,
+        sensor=imu,
         heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,

@@ -28,6 +28,8 @@ from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, Scale
 from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.planning.planned_sensor import PlannedSensor
+from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -81,10 +83,12 @@ class PlannedSurvey:
         path_is_level: whether the camera cannot go up and down, as on a rover.
         photos: field of view and features of the camera; None: the map bends as maps of poses usually do.
         points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
+        sensor: inertial sensor on the camera; None without one.
         allowed_m: (k, 3) allowed places for anchors; None: not given.
         walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
         walls_are: what the walls are, in words.
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
+        times_are_known: whether the times of the path are those of photos; else they are assumed.
         max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
         warnings: what is odd about the plan, a line each.
         site: frame of all positions, from which texts get the coordinates that the user knows.
@@ -103,12 +107,14 @@ class PlannedSurvey:
     photos: PlannedPhotos | None = None
     points: tuple[ControlPoint, ...] = ()
     antenna: PlannedAntenna | None = None
+    sensor: PlannedSensor | None = None
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
     allowed_m: Array | None = None
     walls_m: tuple[Array, ...] = ()
     walls_are: str = "walls"
     is_placed: bool = True
+    times_are_known: bool = True
     max_num_ranges: int = 2000
     warnings: tuple[str, ...] = ()
     site: Site = field(default_factory=Site)
@@ -149,6 +155,11 @@ class PlannedSurvey:
     def ranging(self, num_ranges: int) -> PlannedSurvey:
         """Return the survey with the rate that gives this number of ranges."""
         return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
+
+    @property
+    def given_sizes(self) -> Mapping[str, float]:
+        """Sizes of components of the errors that are known better than from other surveys, by name."""
+        return self.component_stddevs if self.sensor is None else {**self.sensor.sizes, **self.component_stddevs}
 
     @property
     def num_alike(self) -> int:
@@ -201,11 +212,16 @@ class PlannedSurvey:
         stddevs = np.hypot(stddevs, BENDING * lengths)
         return LocatedDistances.control(lengths, stddevs, model_length=lengths)
 
-    def posed(self, observations: RangeObservations, placement: PlacementPrior | None = None) -> ScaleProblem:
+    def posed(
+        self,
+        observations: RangeObservations,
+        placement: PlacementPrior | None = None,
+        gravity: Gravity | None = None,
+    ) -> ScaleProblem:
         """Return the scale problem that a run will solve, with the input that it will have.
 
         Args:
-            placement: what known positions say of the map's place.
+            placement: what known positions say of the map's place. gravity: the upward direction; None: not known.
 
         Raises:
             GeometryError: the run will refuse the input.
@@ -213,7 +229,7 @@ class PlannedSurvey:
         from_site = self.site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
         given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, self.taped_lengths)
-        return scale_problem(RangesOnPath(*given), placement)
+        return scale_problem(RangesOnPath(*given, gravity=gravity), placement)
 
     def state(self, posed: ScaleProblem) -> RangeState:
         """Return the true state in the frame of the problem."""

@@ -25,6 +25,12 @@ from rangesfm.util.processes.threads import with_one_blas_thread
 
 REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""
+ALONE = {
+    "ranges": "ranges alone",
+    "positions": "control points and positions alone",
+    "imu": "the inertial sensor alone",
+}
+"""Kinds of measurement whose result alone is planned, in words."""
 # Most lines of a list, of changes that are advised for one purpose or of mistakes; most components in a line.
 _NUM_LINES, _NUM_COMPONENTS = 8, 5
 # Columns of a mistake's test that do not depend on the measured ranges.
@@ -82,8 +88,8 @@ class SurveyPlan:
         place: placement in the site; None if the frame is the first camera's.
         keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
         verdict, reasons: the run's verdict on the scale; "refused" if it will refuse the scale.
-        by_kind: what ranges alone and known positions alone would give, by "ranges" and "positions"; empty where the
-            plan has one of them.
+        up_stddev_deg: standard deviation of the vertical by the inertial sensor; None without one.
+        by_kind: what each kind of ``ALONE`` would give alone; empty where the plan has one of them.
         warnings: what is odd about the plan, and what a run will leave out.
         mistakes: for each possible mistake the smallest size that would be found (None: no size that can happen), and
             the largest effect of a mistake that is not found, the largest on the scale first (None: without limit).
@@ -103,6 +109,7 @@ class SurveyPlan:
     keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
+    up_stddev_deg: float | None
     by_kind: dict[str, PlannedByKind]
     warnings: tuple[str, ...]
     mistakes: tuple[MistakeTest, ...]
@@ -177,6 +184,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
         verdict=verdict,
         reasons=reasons,
+        up_stddev_deg=None if expected.gravity is None else float(np.rad2deg(expected.gravity.stddev_rad)),
         by_kind=_by_kind(planned),
         warnings=(*planned.warnings, *expected.notes),
         mistakes=_mistakes(expected),
@@ -202,10 +210,16 @@ def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
 
 
 def _by_kind(planned: PlannedSurvey) -> dict[str, PlannedByKind]:
-    if not planned.anchors or not (planned.points or planned.antenna):
+    nothing = replace(planned, anchors=(), points=(), antenna=None, sensor=None)
+    alone = {
+        "ranges": planned.anchors and replace(nothing, anchors=planned.anchors),
+        "positions": (planned.points or planned.antenna)
+        and replace(nothing, points=planned.points, antenna=planned.antenna),
+        "imu": planned.sensor and replace(nothing, sensor=planned.sensor),
+    }
+    found = {kind: _expect(each) for kind, each in alone.items() if each}
+    if len(found) == 1:
         return {}
-    alone = {"ranges": replace(planned, points=(), antenna=None), "positions": replace(planned, anchors=())}
-    found = {kind: _expect(each) for kind, each in alone.items()}
     return {kind: PlannedByKind(each.uncertainty.empirical, each.worst_keyframe_m) for kind, each in found.items()}
 
 
@@ -274,6 +288,8 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     interval = f"{low:+.2g} to {high:+.2g} % (95 %)" if np.isfinite(high) else "open"
     yield f"scale: {plan.verdict}; {interval}"
     yield from (f"  {reason}" for reason in plan.reasons)
+    if plan.up_stddev_deg is not None:
+        yield f"vertical: {_half_width_95(plan.up_stddev_deg, 'deg')} (95 %), by the inertial sensor"
     if plan.place is None:
         yield "place: none, as neither surveyed anchors nor known positions say where the map is in the site"
         return
@@ -290,14 +306,13 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
 
 
 def _alone(plan: SurveyPlan) -> Iterator[str]:
-    words = {"ranges": "ranges alone", "positions": "control points and positions alone"}
     for kind, alone in plan.by_kind.items():
         scale = f"scale +-{_rough(100 * NORMAL_95 * alone.scale_stddev, '%')}"
         is_placed = not np.isnan(alone.worst_keyframe_stddev_m)
         place = (
             f", least certain keyframe {_half_width_95(alone.worst_keyframe_stddev_m)}" if is_placed else ", no place"
         )
-        yield f"{words[kind]} (95 %): {scale}{place}"
+        yield f"{ALONE[kind]} (95 %): {scale}{place}"
 
 
 def _budget(plan: SurveyPlan) -> Iterator[str]:
