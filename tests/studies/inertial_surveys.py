@@ -62,7 +62,7 @@ EVENLY = "moved too evenly"
 
 
 class Found(NamedTuple):
-    """What a survey gave: errors of scale and vertical in stddevs, half of the interval, what is told, and as planned."""
+    """What a survey gave: errors of scale and vertical in stddevs, half the interval, what is told, half as planned."""
 
     scale: float
     vertical: float

@@ -65,19 +65,24 @@ class Noise:
     """Errors of c observations, by component, with their sizes.
 
     Attributes:
-        names, stddevs: of the components: sizes as learnt; the root mean square over observations, in metres, of those
-            that were not learnt.
+        names, sizes: of the components, as learnt; NaN where they were not.
         covariances_m2: (k, c, c) contribution of each.
     """
 
     names: tuple[str, ...]
-    stddevs: Array
+    sizes: Array
     covariances_m2: Array
 
     @property
     def covariance_m2(self) -> Array:
         """(c, c) covariance of all components together, square metres."""
         return np.asarray(self.covariances_m2.sum(axis=0))
+
+    @property
+    def stddevs(self) -> Array:
+        """(k,) sizes as learnt; the root mean square over the observations, in metres, of those that were not."""
+        variances = np.trace(self.covariances_m2, axis1=1, axis2=2) / max(self.covariances_m2.shape[1], 1)
+        return np.where(np.isnan(self.sizes), np.sqrt(np.maximum(variances, 0.0)), self.sizes)
 
     @property
     def stddev_of_component(self) -> dict[str, float]:
@@ -94,7 +99,7 @@ class Noise:
         return replace(
             self,
             names=tuple(self.names[row] for row in kept),
-            stddevs=self.stddevs[kept],
+            sizes=self.sizes[kept],
             covariances_m2=self.covariances_m2[kept],
         )
 
@@ -118,9 +123,8 @@ def noise_of_sizes(components: Sequence[Component], sizes: Mapping[str, float], 
             covariances[name] = covariances[name] + variance * alike if name in covariances else variance * alike
         stddevs[component.name] = sizes[component.name] if component.spread > 0 else np.nan
     of_all = np.array([*covariances.values(), *np.zeros((0, num, num))]).reshape(-1, num, num)
-    mean = np.sqrt(np.maximum(np.trace(of_all, axis1=1, axis2=2), 0.0) / max(num, 1))
     learnt = np.array([stddevs.get(name, np.nan) for name in covariances])
-    return Noise(tuple(covariances), np.where(np.isnan(learnt), mean, learnt), of_all)
+    return Noise(tuple(covariances), learnt, of_all)
 
 
 def usual_sizes(components: Sequence[Component]) -> dict[str, float]:

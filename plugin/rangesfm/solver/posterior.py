@@ -193,8 +193,9 @@ class JointProblem:
         return column
 
     def noise_of(self, kind: str) -> Noise:
-        """Return the errors of the observations of one kind, with those of the map."""
+        """Return the errors of the observations of one kind, with those of the map, as large as they are in these."""
         found = self.noise.of_rows(self.rows[kind])
+        found = replace(found, sizes=np.where([name in BENDS for name in found.names], np.nan, found.sizes))
         return found.only(*(name for name, of in zip(found.names, found.covariances_m2, strict=True) if of.any()))
 
     @property

@@ -36,7 +36,7 @@ class LearnedErrors(Noise):
     @classmethod
     def from_noise(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
         """Return the errors of bins."""
-        return cls(noise.names, noise.stddevs, noise.covariances_m2, bins, bins.of_range)
+        return cls(noise.names, noise.sizes, noise.covariances_m2, bins, bins.of_range)
 
     def subset(self, rows: Indices) -> LearnedErrors:
         """Return the errors of some of the ranges."""
