@@ -186,7 +186,7 @@ def test_spoilt_file_is_named_with_its_line(
         (["--tag_in_cam", "nan,0,0"], r"tag_in_cam_m is \[nan, 0.0, 0.0\], expected a list of 3 numbers of"),
         (["--input_path", "."], r"not a COLMAP model, expected cameras, images and points3D files"),
         (["--input_path", "sparse"], r"/sparse: not a COLMAP model, .*; is it .*/sparse/0\?"),
-        (["--input_path", "none"], r"/none: no such folder of a COLMAP model"),
+        (["--input_path", "none"], r"/none: no such folder of a COLMAP model, or file of a trajectory"),
         (["--output_path", "uwb.csv"], r"/uwb.csv: cannot write to this output folder"),
         (["--output_path", "uwb.csv/out"], r"/uwb.csv/out: cannot write to this output folder \(Not a directory\)"),
         (["--output_path", "."], r"/images.csv: the results would overwrite this input, expected another output path"),

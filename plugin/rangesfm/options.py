@@ -112,7 +112,8 @@ class ImageOptions(KeyframeOptions):
     """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
     the photos' times."""
     model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model", is_common=True)] = None
-    """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then."""
+    """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then. Or a trajectory of the
+    camera in any unit, to be scaled: a TUM file, or a CSV timestamp_s,x_m,y_m,z_m,qx,qy,qz,qw."""
     times: Annotated[Path | None, KeyMeta(flag="image_times", role="file", is_common=True)] = None
     """CSV image_name,timestamp_s with the times of the photos, or another table of photos and times (default: by
     rate_hz if given, else EXIF, else file names)."""

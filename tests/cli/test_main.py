@@ -149,7 +149,10 @@ def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> No
         (["run", "none.toml"], "none.toml: no such file"),
         (["reconstruct", "--ranges", "uwb.csv"], "unknown option --ranges"),
         (["scale", "--ranges", "uwb.csv"], "no model"),
-        (["refine", "--ranges", "uwb.csv", "--input_path", "none"], "no such folder of a COLMAP model"),
+        (
+            ["refine", "--ranges", "uwb.csv", "--input_path", "none"],
+            "no such folder of a COLMAP model, or file of a trajectory",
+        ),
         (["refine", "--input_path", "model"], "no ranges"),
         (["ranges", "none.csv"], "none.csv: no such file"),
         (["ranges", "uwb.csv", "--output_path", "none/ranges.csv"], "cannot be written"),

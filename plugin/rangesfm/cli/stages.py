@@ -185,6 +185,6 @@ def _require_images(survey: Survey) -> None:
 
 
 def _require_model_and_metres(survey: Survey) -> None:
-    if not os.path.isdir(survey.given_model_path):
-        raise InputError("no such folder of a COLMAP model", survey.given_model_path)
+    if not os.path.exists(survey.given_model_path):
+        raise InputError("no such folder of a COLMAP model, or file of a trajectory", survey.given_model_path)
     survey.require_metres()

@@ -172,7 +172,8 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
 
 def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.tape.distances:
-        only = "" if len(inputs.log) else ", which alone determine the scale (no ranges)"
+        is_alone = survey.metric_keys == ["scale.distances"]
+        only = ", which alone determine the scale (no ranges)" if is_alone else ""
         yield f"taped distances: {len(inputs.tape.distances)}{only}"
     yield from inputs.positions.facts()
     if (imu := inputs.imu) is not None:

@@ -14,6 +14,7 @@ import pycolmap
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.reprojection import wrong_axes
+from rangesfm.colmap.trajectory_model import model_of_trajectory
 from rangesfm.diagnostics.preflight import (
     check_units,
     notes_before_work,
@@ -96,12 +97,12 @@ def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
 
 
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
-    """Read a given COLMAP model and warn of what is wrong with it.
+    """Read a given COLMAP model, or a trajectory as one, and warn of what is wrong with it.
 
     Raises:
         InputError: it cannot be read, has no registered images, or its axes are not as in COLMAP.
     """
-    model = read_model(path)
+    model = model_of_trajectory(path) if path.is_file() else read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
     if (said := wrong_axes(model)) is not None:

@@ -136,7 +136,7 @@ class Survey(BaseModel):
         if self.images.path is None:
             raise InputError(
                 "no photos: give [images] path in a survey file, or --images FOLDER; or give a COLMAP model "
-                "([images] model, --input_path MODEL)"
+                "or a trajectory ([images] model, --input_path MODEL)"
             )
         return self.images.path
 

@@ -16,7 +16,7 @@ from rangesfm.measurements.ranges.anchors.anchor_file import LOCAL_M
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising, named_photos
-from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout
+from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, are_quaternions
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
     Choice,
@@ -32,7 +32,6 @@ QUANTITIES = (
 )
 _KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
-_QUATERNION_TOLERANCE = 1e-2
 
 
 def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], list[str]]:
@@ -116,7 +115,7 @@ def _triples(columns: Sequence[ColumnSample]) -> Iterator[dict[str, str]]:
 def _axes_by_values(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
     """Do the same in a table without names: they are three numbers before a quaternion, or the only three."""
     numbers = [column for column in free if column.kind == "numbers"]
-    before = [k for k in range(3, len(numbers) - 3) if _are_quaternions(numbers[k : k + 4])]
+    before = [k for k in range(3, len(numbers) - 3) if are_quaternions(numbers[k : k + 4])]
     places = numbers[before[0] - 3 : before[0]] if before else numbers
     may_be_ids = not before and any(all(map(str.isdigit, column.cells)) for column in places[:2])
     if len(places) != len(AXES) or may_be_ids:
@@ -134,13 +133,6 @@ def _axes_by_values(free: Sequence[ColumnSample], found: Guess) -> dict[str, dic
         "the numbers are x, y, z or east, north, height or longitude, latitude, height": east_first,
         "they are north, east, height or latitude, longitude, height": north_first,
     }
-
-
-def _are_quaternions(columns: Sequence[ColumnSample]) -> bool:
-    if len({len(column.numbers) for column in columns}) > 1:
-        return False
-    lengths = np.linalg.norm([column.numbers for column in columns], axis=0)
-    return bool(np.all(np.abs(lengths - 1.0) < _QUATERNION_TOLERANCE))
 
 
 def _may_be_degrees(places: Sequence[ColumnSample]) -> bool:

@@ -105,9 +105,14 @@ class SurveyedPositions:
         points, is_seen = self.points.points, marks_seen(self.points, model)
         unseen = [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]
         if unseen:
+            marked = (
+                ""
+                if self.markers.keys() & {*unseen}
+                else f"; there are marks of {', '.join([*self.markers][:8]) or 'none'}"
+            )
             yield (
                 f"{len(unseen)} of {len(points)} known points are left out, as fewer than two photos of the map have "
-                f"marks of them: {', '.join(unseen)}"
+                f"marks of them: {', '.join(unseen)}{marked}"
             )
 
     def moved(self, offset_m: Array) -> SurveyedPositions:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 QUATERNION_TOLERANCE = 1e-2
+_NANOSECONDS = re.compile(r"\d{19}(?:\.0*)?", re.ASCII)
 MAX_TIME_DIFFERENCE_S = 0.01
 """A sample this close in time is used without interpolation; at 1 m/s it is off by a centimetre at most."""
 
@@ -213,7 +215,15 @@ def tum_table(path: Path) -> TextTable:
             expected = f"{len(columns)} (timestamp tx ty tz qx qy qz qw, separated by blanks)"
             raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
     lines = np.array([line for line, _ in rows], dtype=np.int64)
-    return TextTable(path, columns, lines, {name: [cells[i] for _, cells in rows] for i, name in enumerate(columns)})
+    by_name = {name: [row[i] for _, row in rows] for i, name in enumerate(columns)}
+    return TextTable(path, columns, lines, {**by_name, columns[0]: _in_seconds(by_name[columns[0]])})
+
+
+def _in_seconds(cells: list[str]) -> list[str]:
+    """Return times in seconds, where all of them are nanoseconds since 1970, as ORB-SLAM3 writes them."""
+    if not all(re.fullmatch(_NANOSECONDS, cell) for cell in cells):
+        return cells
+    return [f"{cell[:-9]}.{cell[-9:]}" for cell in (cell.partition(".")[0] for cell in cells)]
 
 
 def _from_table(table: TextTable, key: str) -> Reference:
@@ -222,12 +232,15 @@ def _from_table(table: TextTable, key: str) -> Reference:
     table, notes = _with_positions(table)
     positions = np.column_stack([table.numbers(column, bounds=COORDINATE_M) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
-    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key, bounds=TIME_S).tolist()):
-        raise table.error(again[0], key, "each one once")
     if key == "image_name":
+        if again := repeated(table.text(key)):
+            raise table.error(again[0], key, "each one once")
         return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations, notes=notes)
     times = table.numbers(key, bounds=TIME_S)
-    order = np.argsort(times)
+    _, order = np.unique(times, return_index=True)  # motion capture may write two poses with one rounded time
+    if num_again := len(times) - len(order):
+        told = f"{num_again} of {len(times)} poses have the time of an earlier one and are left out"
+        notes = (*notes, f"{table.path.name}: {told}")
     turns = None if rotations is None else rotations[order]
     return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns, notes=notes)
 

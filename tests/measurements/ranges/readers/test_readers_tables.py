@@ -435,6 +435,13 @@ def test_ranges_beside_a_position_are_found(tmp_path: Path) -> None:
         read_ranges(write(tmp_path, only))
 
 
+@pytest.mark.parametrize("names", ["", "# timestamp tx ty tz qx qy qz qw\n"])
+def test_a_trajectory_is_no_log(names: str, tmp_path: Path) -> None:
+    rows = "".join(f"{1e9 + 0.1 * k:.3f} {k / 7:.3f} 1.5 {2 + k / 9:.3f} 0.5 0.5 0.5 0.5\n" for k in range(30))
+    with pytest.raises(InputError, match=r"holds poses over time \(a trajectory\) and no ranges"):
+        read_ranges(write(tmp_path, names + rows))
+
+
 def test_ranges_within_a_record_by_anchor_are_read(tmp_path: Path) -> None:
     def record(rows: list[Row]) -> str:
         by_anchor = ", ".join(

@@ -40,6 +40,7 @@ MISSING = (
 _SEPARATORS = "\t;|, "  # the comma and the blank come last, because numbers may contain commas and times blanks
 _NUM_ROWS = 1000  # rows from which the layout is found
 _MOST_OF_LIST = 64  # lines of a list that somebody wrote
+_QUATERNION_TOLERANCE = 1e-2
 _MAX_NUM_WORDS = 20  # lines of text before the table
 _MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
@@ -213,6 +214,14 @@ class Layout:
         cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
         notes += ["numbers have decimal commas"] if any(cure.commas for cure in cures.values()) else []
         return replace(table, cells={**table.cells, **cured}), notes
+
+
+def are_quaternions(columns: Sequence[ColumnSample]) -> bool:
+    """Return whether four columns of numbers are unit quaternions."""
+    if len({len(column.numbers) for column in columns}) > 1 or not len(columns[0].numbers):
+        return False
+    lengths = np.linalg.norm([column.numbers for column in columns], axis=0)
+    return bool(np.all(np.abs(lengths - 1.0) < _QUATERNION_TOLERANCE))
 
 
 def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:

@@ -19,7 +19,7 @@ from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.measurements.ranges.readers.columns import QUANTITIES, STAMPS, RangeColumns, read_columns
 from rangesfm.measurements.ranges.readers.guess import Guess, described, guess_columns
-from rangesfm.measurements.ranges.readers.layout import Layout, find_layout, layout_without_header
+from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions, find_layout, layout_without_header
 from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import FOUND, header_names, read_head, write_user_table
@@ -77,13 +77,25 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
     """
     layout = find_layout(path, options.separator or "")
     guess = None if layout is None else guess_columns(layout)
-    if layout is None or guess is None or guess.missing or guess.doubts:
+    if (
+        layout is None
+        or guess is None
+        or guess.missing
+        or guess.doubts
+        or (not layout.has_names and _is_trajectory(layout))
+    ):
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
     columns = RangeColumns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
     return replace(
         TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), roles=guess.roles
     )
+
+
+def _is_trajectory(layout: Layout) -> bool:
+    """Return whether a table has the columns of a TUM trajectory: time, x, y, z, and a quaternion."""
+    columns = layout.columns
+    return len(columns) == 8 and all(one.kind == "numbers" for one in columns) and are_quaternions(columns[4:])
 
 
 def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
@@ -96,6 +108,8 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
 
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
+    if layout is not None and _is_trajectory(layout):
+        return InputError("holds poses over time (a trajectory) and no ranges", path)
     head = read_head(path)
     reasons = _NO_RANGES if guess is None or "range" in guess.missing else _NO_RANGES[:1]
     if instead := next((what for pattern, what in reasons if pattern.search(head)), None):
