@@ -204,7 +204,7 @@ def test_what_was_done_when_by_whom_and_in_which_coordinates(make_result: MakeRe
     assert "Hall 7, north" in page.texts
     facts, used = facts_on(page), summary["ranges"]["num_used"]
     assert facts["What was done"].startswith("20 photos along ")
-    assert f" {used} of 80 ranges to 8 radio anchors, 8 of them surveyed" in facts["What was done"]
+    assert f" {used} of 80 ranges to 8 radio anchors at known positions" in facts["What was done"]
     assert facts["What was done"].endswith("Photos and measurements were adjusted together.")
     assert facts["When"] == "14 May 2026, 14:20 to 14:22 by the photos' clock"
     assert facts["By"] == "E. Muster"
@@ -217,7 +217,9 @@ def test_a_fact_that_is_not_known_is_left_out(make_result: MakeResult) -> None:
     facts = facts_on(page_of(folder))  # the photos' clock does not tell the date
     assert facts.keys() == {"What was done", "Coordinates", "Computed"}
     assert facts["What was done"].endswith("The map was scaled as a whole.")
-    assert facts["Coordinates"].startswith("x right, y down, z forward in metres from the first photo, image00000.jpg.")
+    assert facts["Coordinates"].startswith(
+        "x, y, z in metres in the frame of the first photo, image00000.jpg (x right, y down, z forward)."
+    )
 
 
 def test_only_mistakes_that_were_found_stand_above_the_appendix(make_result: MakeResult) -> None:

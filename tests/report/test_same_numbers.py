@@ -99,7 +99,7 @@ def test_place_clocks_and_residuals_are_the_same_everywhere(told: Told) -> None:
     for axis, stddev_m in zip("xyz", place["stddev_m"]):
         assert f"{axis} ± {HALF * stddev_m:.2f} m" in told.page
     worst_m = HALF * place["worst_keyframe_stddev_m"]
-    assert f"the worst photo ± {worst_m:.2f} m" in told.page
+    assert f"the least certain photo ± {worst_m:.2f} m" in told.page
     assert f"each keyframe to {worst_m:.2g} m or better (95 %)" in told.line("place: good: ")
     assert told.line("ranges: ") == (
         f"{ranges['num_used']} of {ranges['num']} used; they differ from the map by {ranges['rms_m']:.3f} m (rms), "

@@ -117,7 +117,7 @@ def panel_spec(panel: Panel, data_of: Callable[[int], Spec]) -> Spec:
     width, height = panel.size
     x_range, y_range = panel.limits
     x_label, y_label = panel.labels
-    x_axis = {"title": x_label, "tickCount": 4 if panel.rows or width < 380 else 6}
+    x_axis = {"title": x_label, "tickCount": 3 if panel.rows else 4 if width < 380 else 6}
     y_axis = None if panel.rows else {"title": y_label, "tickCount": 5}
     return {
         "width": width,

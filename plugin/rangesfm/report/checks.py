@@ -58,7 +58,7 @@ class QualityCheck:
 def quality_checks(summary: ResultSummary) -> tuple[QualityCheck, ...]:
     """Return the checks of a result, the most important one first."""
     half_width = summary.scale.half_width_95
-    of_scale = "Half of the 95 % interval of the scale: lengths in the map may be off by this share."
+    of_scale = "Half of the 95 % interval of the scale: lengths in the map may be off by as much."
     width_percent = math.nan if half_width is None else 100 * half_width
     reprojection_px = known(None if summary.refine is None else summary.refine.reprojection_rms_px)
     of_points = "RMS distance in the photos between the points of the map and the features that show them."
@@ -72,7 +72,7 @@ def quality_checks(summary: ResultSummary) -> tuple[QualityCheck, ...]:
 def _checks_of_ranges(summary: ResultSummary) -> Iterator[QualityCheck]:
     ranges, offset = summary.ranges, summary.time_offset
 
-    def told(key: str, text_of: Callable[[Any], str] = count) -> str:
+    def marked(key: str, text_of: Callable[[Any], str] = count) -> str:
         value = attrgetter(key)(summary)
         return keyed(key, value, text_of(value))
 
@@ -81,26 +81,28 @@ def _checks_of_ranges(summary: ResultSummary) -> Iterator[QualityCheck]:
             name = mistake_in_words(test.name, test.subject).capitalize()
             yield QualityCheck(name, meaning, test.statistic, "m", 3, limit=test.threshold, key=f"tests.{i}.statistic")
     of_ranges = Markup("RMS difference between the ranges used and the map; half of the differences are below {}.")
-    median = told("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
+    median = marked("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
     yield QualityCheck("Ranges and map", of_ranges.format(median), known(ranges.rms_m), "m", 3, key="ranges.rms_m")
-    of_check = Markup("RMS difference between the map and {} ranges that were held out of all estimates.")
-    num, checked_m = told("check_ranges.num"), known(summary.check_ranges.rms_m)
+    of_check = Markup("RMS difference between the map and {} ranges that took no part in the estimate.")
+    num, checked_m = marked("check_ranges.num"), known(summary.check_ranges.rms_m)
     if summary.check_ranges.num:
         yield QualityCheck("Check ranges", of_check.format(num), checked_m, "m", 3, key="check_ranges.rms_m")
-    of_share = Markup("{} of the {} ranges in the log were used.").format(told("ranges.num_used"), told("ranges.num"))
+    of_share = Markup("{} of the {} ranges in the log were used.").format(
+        marked("ranges.num_used"), marked("ranges.num")
+    )
     share_percent = 100.0 * ranges.num_used / ranges.num if ranges.num else math.nan
     yield QualityCheck("Ranges used", of_share, share_percent, "%", 1)
     decimals = min(decimals_for(offset.stddev_s, default=3), 6)
     of_clocks = Markup("Half of the 95 % interval of the time offset (image time minus range time), which is {}. {}")
-    value = told("time_offset.value_s", lambda x: signed(x, decimals, "s"))
+    value = marked("time_offset.value_s", lambda x: signed(x, decimals, "s"))
     does_not = sentence(offset.note or "any offset near this one gives the same result")
-    told_clocks = of_clocks.format(value, does_not if offset.offset_matters is False else "")
+    text_of_clocks = of_clocks.format(value, does_not if offset.offset_matters is False else "")
     within_s, key = NORMAL_95 * known(offset.stddev_s), "time_offset.stddev_s"
-    yield QualityCheck("Clocks", told_clocks, within_s, "s", 3, key=key, times=NORMAL_95)
+    yield QualityCheck("Clocks", text_of_clocks, within_s, "s", 3, key=key, times=NORMAL_95)
 
 
 # Tests whose value is the size of an error of all ranges, with the meaning of that size.
 _OF_ALL_RANGES = {
     "range noise": "Standard deviation of a range from those right before and after; lasting errors are not in it.",
-    "lasting errors": "RMS error that ranges share for seconds, such as that of the antennas or of blocked sight.",
+    "lasting errors": "RMS error that is the same in ranges within seconds, as by antennas or a blocked line of sight.",
 }

@@ -31,10 +31,7 @@ def _what(content: Content) -> str:
     way = "" if length_m is None else f" along {fixed(length_m, 1, 'm')}"
     said = [f"{count(summary.map.num_photos)} photos{way} show {num_points} points."]
     if summary.has_ranges:
-        num_surveyed = sum(anchor.surveyed_position_m is not None for anchor in summary.anchors.values())
-        surveyed = f"{num_surveyed} of them surveyed" if num_surveyed else "none of them surveyed"
-        of_anchors = f"{len(summary.anchors)} radio anchors, {surveyed}"
-        said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {of_anchors}, give it metres.")
+        said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {_anchors(content)} give it metres.")
     if summary.imu is not None:
         num = count(summary.imu.num_used)
         said.append(f"{num} samples of an inertial sensor give it metres, and say what is up.")
@@ -43,6 +40,16 @@ def _what(content: Content) -> str:
     if summary.refine is None or not summary.refine.kept:
         return " ".join((*said, "The map was scaled as a whole."))
     return " ".join((*said, "Photos and measurements were adjusted together."))
+
+
+def _anchors(content: Content) -> str:
+    """Return how many anchors there are, and whether their positions were given."""
+    anchors = content.summary.anchors.values()
+    num, num_given = len(anchors), sum(anchor.surveyed_position_m is not None for anchor in anchors)
+    if num == 1:
+        return "1 radio anchor at a known position" if num_given else "1 radio anchor at an unknown position"
+    where = "unknown positions" if num_given == 0 else "known positions" if num_given == num else None
+    return f"{num} radio anchors" + (f" at {where}" if where else f", {num_given} of them at known positions,")
 
 
 def _when(content: Content) -> str:
@@ -66,13 +73,20 @@ def _computed(content: Content) -> str:
 
 
 def _coordinates(content: Content) -> str:
-    summary, path = content.summary, content.final
+    summary = content.summary
     if summary.frame == "site":
         anchors, crs = summary.settings.anchors.path, summary.settings.anchors.crs
         whose = "the site" if anchors is None else f"the site, those of {anchors.rsplit('/', 1)[-1]}"
         return f"x, y, z in metres in the frame of {whose}{'' if crs is None else f' ({crs})'}; z is up."
-    first = "first photo" if path is None else f"first photo, {path.image_names[0]}"
-    return f"x right, y down, z forward in metres from the {first}. Nothing fixes the map's place in a site."
+    return f"x, y, z in metres in {frame_in_words(content)}. Nothing fixes the map's place in a site."
+
+
+def frame_in_words(content: Content) -> str:
+    """Return which frame the coordinates of a map have, and the directions of its axes."""
+    if content.summary.frame == "site":
+        return "the site's frame, with z up"
+    first = "the first photo" if content.final is None else f"the first photo, {content.final.image_names[0]}"
+    return f"the frame of {first} (x right, y down, z forward)"
 
 
 def _day(date: datetime) -> str:

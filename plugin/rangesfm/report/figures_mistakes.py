@@ -53,7 +53,7 @@ def mistakes_figure(content: Content) -> Figure | None:
         band=("half of the scale's 95 % interval", 0.0, 50 * math.log(high / low)),
     )
     caption = (
-        "Tests of possible mistakes. Left: how strongly the ranges speak for each mistake, with its estimated size; "
+        "Tests of possible mistakes. Left: the evidence for each mistake in the measurements, with its estimated size; "
         "beyond the line it is more than chance explains. Right: how much a mistake may change the scale that is just "
         "too small to be found, with that size. Values beyond an axis are drawn at its edge; the table has them."
     )

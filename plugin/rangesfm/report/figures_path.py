@@ -6,6 +6,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.report.content import Content
+from rangesfm.report.facts import frame_in_words
 from rangesfm.report.plot import (
     WIDE_SIZE,
     Figure,
@@ -34,7 +35,12 @@ def trajectory_views(content: Content) -> Figure | None:
         return None
     frame = content.summary.frame
     views = tuple(_trajectory_view(content, view) for view in views_of(content.final.centers, frame))
-    caption = f"The camera's path in metres, in the {'site' if frame == 'site' else 'first camera'} frame."
+    caption = (
+        f"The camera's path in metres, in {frame_in_words(content)}. Scaled: the unscaled map with the scale found. "
+    )
+    caption += "Refined: after photos and measurements were adjusted together."
+    if content.true_scale is not None:
+        caption += " True scale: the unscaled map with the scale of the reference, so that only its drift is left."
     return Figure("trajectory", caption, views, layout="views")
 
 

@@ -15,7 +15,9 @@ from markupsafe import Markup
 from rangesfm.arrays import median, rms
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
+from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.report.content import Content
+from rangesfm.report.facts import frame_in_words
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
 from rangesfm.result.entries import AnchorEntry, rmse_heading
 from rangesfm.survey.settings import KEYS
@@ -44,6 +46,15 @@ _REFINEMENT = {
     "short_range_error_m": "error of short ranges, m",
 }
 
+_STATUSES = {
+    RangeStatus.DOWN_WEIGHTED.label: "used with less weight, because its residual is large",
+    RangeStatus.OUTLIER.label: "rejected, because its residual is too large",
+    RangeStatus.NO_KEYFRAME_NEAR.label: "taken between photos too far apart in time to know the camera's position",
+    RangeStatus.OUTSIDE_PATH.label: "taken before the first or after the last photo of the map",
+    RangeStatus.UNKNOWN_IMAGE.label: "its photo is not in the map",
+    RangeStatus.UNKNOWN_ANCHOR.label: "to an anchor that is not used",
+    RangeStatus.CHECK.label: "takes no part in the estimate, and is compared with the result",
+}
 _ALIGNED = {
     "site": "in the site's frame, without any alignment",
     "first_camera": "after alignment by the pose of the first keyframe, because the map has no place in the site",
@@ -85,7 +96,9 @@ def range_statuses(content: Content) -> ReportTable:
     """Return the table of how many ranges of the log have each status."""
     statuses = Counter([] if content.ranges is None else content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
-    return ReportTable("What became of the ranges", ["status", "ranges", "share"], rows)
+    meanings = [f"{name}: {_STATUSES[name]}" for name in statuses if name in _STATUSES]
+    note = sentence("; ".join(meanings)) if meanings else None
+    return ReportTable("What became of the ranges", ["status", "ranges", "of all"], rows, note)
 
 
 def ranges_per_anchor(content: Content) -> ReportTable:
@@ -122,14 +135,12 @@ def mistakes(content: Content, *, are_found: bool) -> ReportTable:
             )
         note += (
             ". A mistake that is not found may still be there, if it is smaller than the smallest one found. The last "
-            "two columns say how much it may then change the scale (as a fraction of it) and places in the map. All "
+            "two columns say how much it may then change the scale and places in the map. All "
             "tests are in result.json"
         )
     numbers = {
         "stddev": "± (95 %)",
         "smallest_detectable": "smallest found",
-        "effect_on_scale": "effect on scale",
-        "effect_on_place_m": "on places m",
     }
     likeliest: set[str] = set()
     for i, test in enumerate(tests):
@@ -142,6 +153,10 @@ def mistakes(content: Content, *, are_found: bool) -> ReportTable:
         unfound = "would not be found" if test.smallest_detectable is None else "not found"
         others = f" ({num_others} others of this kind have less evidence)" if num_others else ""
         cells = _cells(f"tests.{i}", test, dict.fromkeys(numbers, partial(fixed, decimals=4)))
+        effect = test.effect_on_scale
+        effect_percent = fixed(None if effect is None else 100 * effect, 2)
+        cells.append(keyed(f"tests.{i}.effect_on_scale", effect, effect_percent, times=100))
+        cells += _cells(f"tests.{i}", test, {"effect_on_place_m": partial(fixed, decimals=4)})
         unit = "fraction" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
         rows.append([mistake_in_words(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
@@ -154,6 +169,8 @@ def mistakes(content: Content, *, are_found: bool) -> ReportTable:
             "",
             "unit",
             *numbers.values(),
+            "effect on scale %",
+            "on places m",
         ],
         rows,
         f"{note}.",
@@ -225,8 +242,12 @@ def anchors(content: Content) -> ReportTable:
     given = content.summary.anchors
     rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in sorted({*given}, key=natural_order)]
     header = ["anchor", "x m", "y m", "z m", "± m (95 %)", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
-    note = "Δ: estimated minus surveyed position, for surveyed anchors. ± 0: the position was held fixed."
-    return ReportTable("Anchors in the map's frame", header, rows, note)
+    note = (
+        f"Coordinates are in {frame_in_words(content)}. Δ: estimated minus given position. ± 0: the given position was "
+        "taken as exact. Range bias: by how much ranges to the anchor are too long. Mirror image: another position "
+        "that fits the ranges as well."
+    )
+    return ReportTable("Anchors", header, rows, note)
 
 
 def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
@@ -281,7 +302,7 @@ def control_points(content: Content) -> ReportTable:
             axes = [fixed(x, 3) for x in errors.rmse_m]
             rows.append([f"RMSE of {errors.num}", kind, "", "", "", "", *axes, fixed(errors.rmse_3d_m, 3)])
     header = ["point", "kind", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "distance m"]
-    note = "Δ: in the map minus known. Control points hold the map; check points take no part in it."
+    note = "Δ: in the map minus known. Control points are used; check points take no part in the estimate."
     return ReportTable("Control and check points", header, rows, note)
 
 

@@ -58,6 +58,7 @@ class ScenePath:
         color: name of a colour of the page's style.
         trajectory: in the frame of the scene, metres.
         has_orientations: whether camera orientations are known, so that frusta can be drawn.
+        is_shown: whether it is drawn before the reader chooses.
     """
 
     id: str
@@ -65,6 +66,7 @@ class ScenePath:
     color: str
     trajectory: Trajectory
     has_orientations: bool = True
+    is_shown: bool = True
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ def scene_of(content: Content) -> Scene | None:
         reference = Trajectory(np.arange(n), tuple(map(str, range(n))), None, content.reference_m, nowhere)
         paths.append(ScenePath("reference", "Reference", "reference", reference, False))
     if content.scaled:
-        paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled))
+        # Often it is hardly apart from the refined path, and the colours of both would be mixed.
+        is_result = content.refined is None
+        paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled, is_shown=is_result))
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
     summary = content.summary
@@ -124,7 +128,8 @@ def scene_of(content: Content) -> Scene | None:
 def view_of(scene: Scene) -> dict[str, Any]:
     """Return the data of the view on the page.
 
-    They are what the script draws, the layers (id, name, colour and shape of the swatch), and a note for the reader.
+    They are what the script draws, the layers (id, name, colour and shape of the swatch, whether each is drawn at
+    first), and a note for the reader.
     """
     seen = [_around(scene)]
     if len(scene.points_m):
@@ -143,9 +148,12 @@ def view_of(scene: Scene) -> dict[str, Any]:
     pictures = {} if content is None else thumbnails(content.images_path, photos)
     points, ranges = _points(scene, origin_m), None if content is None else _ranges(content, scene.result)
     anchors = [_anchor(id_, anchor, origin_m) for id_, anchor in scene.anchors.items() if anchor.position_m is not None]
-    layers = [("points", "Map points", "map", "dots")] if points else []
-    layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
-    layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
+    layers = [("points", "Map points", "map", "dots", True)] if points else []
+    layers += [
+        (path.id, path.name, path.color, "line" if path.has_orientations else "dashed", path.is_shown)
+        for path in scene.paths
+    ]
+    layers += [("anchors", "Anchors", "anchor", "triangle", True)] if anchors else []
     errors = None
     if content is not None:
         anchor_ids = [anchor["id"] for anchor in anchors]
@@ -175,7 +183,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "thumbnails": pictures,
         "errors": errors,
         "scale_interval": [end / scale.value for end in scale.interval_95] if scale and scale.interval_95 else None,
-        "layers": [*layers, ("grid", "Grid", "muted", "box")],
+        "layers": [*layers, ("grid", "Grid", "muted", "box", True)],
         "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }

@@ -95,10 +95,12 @@ class View {
     const on = (event, selector, act) => {
       for (const node of this.root.querySelectorAll(selector)) node.addEventListener(event, () => act(node));
     };
-    on("change", "[name=layer]", (box) => {
+    const show = (box) => {
       this.layers[box.value].visible = box.checked;
       this.stage.requestFrame();
-    });
+    };
+    this.root.querySelectorAll("[name=layer]").forEach(show);
+    on("change", "[name=layer]", show);
     on("change", "[name=measure]", ({ checked }) => {
       this.canvas.classList.toggle("measuring", checked);
       this.measuring.clear(checked ? "Click two points, cameras or anchors." : "");
