@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 from tests.known import known
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges
+from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
@@ -59,7 +58,7 @@ def test_an_anchor_whose_height_nothing_determines_stays_near(seed: int) -> None
     assert off_m < 1.2 * float(np.sqrt(np.mean(given.residual_m**2)))
 
 
-def drifting(share: float, seed: int) -> tuple[ScaleEstimate, RangesOnMap, Array, Array]:
+def drifting(share: float, seed: int) -> tuple[ScaleEstimate, Array, Array]:
     """A walk of three rounds whose scale shrinks by a share from its start to its end, among four surveyed anchors.
 
     Returns the estimate for the path as one piece, its ranges, and the unscaled and the true places (n, 3).
@@ -81,15 +80,13 @@ def drifting(share: float, seed: int) -> tuple[ScaleEstimate, RangesOnMap, Array
     log = RangeLog.from_arrays(np.array(list("ABCD"))[which], range_m, timestamp_s=at_s)
     anchors = [Anchor(name, at) for name, at in zip("ABCD", anchors_m, strict=True)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="site")
-    bending = WalkBending(in_first_camera(path))
-    ranges = known(found.find(RangeScale))
-    return found, ranges_on_map(ranges.posed, ranges.solution, bending), path.centers, places
+    return found, path.centers, places
 
 
 def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:
-    rigid, given, path, places = drifting(0.3, seed=0)
-    bent = bent_to_ranges(given)
-    placed = estimate_by_bent(rigid, bent, ScaleOptions())
+    rigid, path, places = drifting(0.3, seed=0)
+    placed = rigid.where_bent(ScaleOptions())
+    bent_by_m = known(rigid.find(RangeScale)).bends_m(known(rigid.on_map))
     best = align_points(path, places)
     off_m = rmse(best.apply(path) - places)
     assert off_m > 0.5
@@ -99,12 +96,13 @@ def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much
     assert half_width < 0.5 * rigid.uncertainty.half_width_95
     assert abs(np.log(placed.value / best.scale)) < half_width
     assert placed.reasons[-1] == "the path drifts by 0.52 m (root mean square) from where the ranges have it"
-    assert rmse(bends_m(bent)[:, None]) == pytest.approx(off_m, abs=0.02)
+    assert rmse(bent_by_m[:, None]) == pytest.approx(off_m, abs=0.02)
     used = placed.observations.status == RangeStatus.USED
     assert used.mean() > 0.95
     np.testing.assert_allclose(placed.errors.stddev_m, 0.05, rtol=0.2)
 
 
 def test_a_path_that_does_not_drift_stays_as_it_was() -> None:
-    rigid, given, _, _ = drifting(0.0, seed=1)
-    assert estimate_by_bent(rigid, bent_to_ranges(given), ScaleOptions()) is rigid
+    rigid, _, _ = drifting(0.0, seed=1)
+    assert [*known(rigid.find(RangeScale)).bent(known(rigid.on_map))] == []
+    assert rigid.where_bent(ScaleOptions()).metric_from_sfm is rigid.metric_from_sfm

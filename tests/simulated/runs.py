@@ -12,15 +12,13 @@ from tests.simulated.surveys import MadeSurvey
 
 from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import ScaleOptions
@@ -98,11 +96,10 @@ def run(survey: MadeSurvey, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(survey, None, None, refusal=str(error))
-    ranges = estimate.find(RangeScale)
+    ranges, on_map = estimate.find(RangeScale), estimate.on_map
     assert ranges is not None
-    on_map = bent_to_ranges(ranges_on_map(ranges.posed, ranges.solution, ranges.bending))
-    estimate = estimate_by_bent(estimate, on_map, options)
-    return Run(survey, estimate, diagnose_ranges(on_map, seed=seed), on_map)
+    assert on_map is not None
+    return Run(survey, estimate.where_bent(options), ranges.tests(on_map, {}), ranges.on(on_map))
 
 
 def _near_truth(survey: MadeSurvey) -> Callable[[RangeProblem, int], list[RangeState]]:

@@ -49,11 +49,10 @@ from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, 
 from tests.studies.measured_distances import KINDS
 
 import rangesfm
-from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale
-from rangesfm.measurements.ranges.mistakes.linearized import linearized, ranges_on_map
+from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.pipeline import result_records
@@ -229,11 +228,11 @@ def tables_of(metric: MetricResult) -> Values:
 
 def range_equations_of(metric: MetricResult) -> Values:
     """Return residuals of ranges, their derivatives by the map as a whole and the anchors, and the same of priors."""
-    at = None if metric.at_refined is None else find_kind(metric.at_refined.moved(), RangeScale)
-    on_map = metric.on_map if at is None else ranges_on_map(at.posed, at.solution, at.bending)
-    if on_map is None:
+    on_map = metric.all_measured
+    if on_map is None or (ranges := on_map.find(RangeScale)) is None:
         return {}
-    problem = linearized(on_map).with_learnt_errors()
+    moved = ranges.moved(on_map.posterior) if on_map.is_at_rest else ranges
+    problem = linearized(moved.on(on_map)).with_learnt_errors()
     return {
         "ranges residual": problem.residual_m,
         "ranges derivatives": problem.design,

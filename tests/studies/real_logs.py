@@ -31,7 +31,6 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
@@ -40,18 +39,13 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.components import components, population
 from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, correct_ranges
 from rangesfm.measurements.ranges.errors.radio_calibration import calibrate_ranges
-from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
-from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
-from rangesfm.measurements.ranges.mistakes.diagnosis import diagnose_ranges
-from rangesfm.measurements.ranges.mistakes.linearized import ranges_on_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import AssociationOptions, ScaleOptions
-from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.reference import Reference, read_reference
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
 
@@ -194,7 +188,7 @@ def one_survey(
     options = ScaleOptions(max_relative_stddev=1.0)
     try:
         found, causes = judged(
-            initialize_scale(observations, path, case.anchors, anchor_frame=case.frame, options=options), path, options
+            initialize_scale(observations, path, case.anchors, anchor_frame=case.frame, options=options), options
         )
     except GeometryError as refusal:
         print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
@@ -211,13 +205,12 @@ def one_survey(
     return error, low, high, len(causes)
 
 
-def judged(found: ScaleEstimate, path: Trajectory, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
+def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
     """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
-    ranges = found.find(RangeScale)
+    ranges, on_map = found.find(RangeScale), found.on_map
     assert ranges is not None
-    on_map = ranges_on_map(ranges.posed, ranges.solution, WalkBending(in_first_camera(path)))
-    on_map = likelier_sides(bent_to_ranges(on_map, ranges.solution.rivals)).on_map
-    return estimate_by_bent(found, on_map, options), [cause.words for cause in diagnose_ranges(on_map).causes]
+    assert on_map is not None
+    return found.where_bent(options), [cause.words for cause in ranges.tests(on_map, {}).causes]
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.joint_map import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
-from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -232,8 +231,7 @@ def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
 
 def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
     """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
-    if (ranges := estimate.find(RangeScale)) is not None:
-        old_m = float(np.median(np.abs(ranges.solution.fit.residuals_m)))
+    if np.isfinite(old_m := estimate.ranges.median_off_m):
         new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
         if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
             yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"

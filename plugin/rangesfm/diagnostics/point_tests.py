@@ -86,7 +86,7 @@ def diagnose_points(
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])
     rows = _tested(off_m, np.diag(own) + of_map, tested)
     reasons = tuple(f"{row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in rows if row.rejected)
-    return MistakeTests(tuple(rows), reasons)
+    return MistakeTests(tuple(rows), reasons, of_place=reasons)
 
 
 def _tested(off_m: Array, covariance_m2: Array, points: Sequence[ControlPoint]) -> list[MistakeTest]:

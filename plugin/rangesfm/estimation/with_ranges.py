@@ -16,7 +16,7 @@ from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.lengths.cost import TapedLengths
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
+from rangesfm.measurements.ranges.cost import CLOCK, SHORT, anchors_at
 from rangesfm.measurements.ranges.errors.range_errors import Misfit, RangeErrors, misfits
 from rangesfm.measurements.ranges.radio import RadioLog, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
@@ -96,7 +96,7 @@ def refine_with_ranges(
         )
         rest = refine(problem, measured.markers)
         covariance = joint_errors(rest, 1.0) if options.covariance else None
-    return metric, summarize(rest, ranges, covariance, 1.0)
+    return metric, summarize(rest, measured, covariance, 1.0)
 
 
 @dataclass(frozen=True)
@@ -181,15 +181,16 @@ class RefineSummary:
 
 
 def summarize(
-    rest: MapAtRest, given: Ranges, covariance: JointCovariance | None, bending_factor: float
+    rest: MapAtRest, measured: Measured, covariance: JointCovariance | None, bending_factor: float
 ) -> RefineSummary:
     """Summarise a refinement.
 
     Args:
-        rest: the map at rest. given: the ranges before, which may be none.
+        rest: the map at rest. measured: all that was measured, the log of a radio in it, which may be empty.
         covariance, bending_factor: as in the summary.
     """
-    ranges = ranges_of(rest.problem.kinds, given)
+    [radio] = (source for source in measured.sources if isinstance(source, RadioLog))
+    ranges = ranges_of(rest.problem.kinds, radio.ranges)
     state, solutions = rest.state, rest.solutions
     if not len(ranges.rows):
         state = replace(state, blocks={**ranges.blocks, **state.blocks})

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 import numpy as np
 from scipy import special
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.source import Source
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
@@ -36,6 +36,9 @@ from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, mov
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from rangesfm.measurements.ranges.mistakes.anchor_sides import AnchorSides
+    from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 
 
 class Doubt(NamedTuple):
@@ -59,6 +62,10 @@ class Located(ABC):
 class KindOnMap(Located):
     """Measurements of one kind, located in a map that moves as a whole."""
 
+    clock: ClassVar[str] = ""
+    """Component of their errors that is due to their clock; a fit that estimates its offset takes it out."""
+    shows_bending: ClassVar[bool] = False
+    """Whether there are so many of them that they show by how much a map is bent."""
     is_solved: ClassVar[bool] = False
     """Whether they were solved with unknowns of their own, so that a map with them is linear about their solution."""
 
@@ -144,6 +151,10 @@ class KindOnMap(Located):
         del on_map
         return self
 
+    def of_log(self, before: RangeEstimate) -> RangeEstimate:
+        """Return what is said of the ranges of the log; what was known before if they are of another kind."""
+        return before
+
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> Self:
         """Return them on the map that was bent by steps, and then moved as a whole to the estimate of a posterior."""
         del known, bent
@@ -170,7 +181,36 @@ class KindOnMap(Located):
             on_map: all that is measured in the map. by_kind: the scale by each kind alone, where several are used.
         """
         against = self.against_others(on_map, by_kind)
-        return MistakeTests(against, tuple(f"{row.words}: {row.remedy}" for row in against if row.rejected))
+        reasons = tuple(f"{row.words}: {row.remedy}" for row in against if row.rejected)
+        return MistakeTests(against, reasons, of_place=reasons if self.places_map else ())
+
+    def cause(self, on_map: JointMap) -> str:
+        """Return their likeliest mistake, with its remedy, where a map is refused; empty if there is none."""
+        del on_map
+        return ""
+
+    def bends_m(self, on_map: JointMap) -> Array:
+        """Return (n,) how far they bend each keyframe of a map that is only scaled; (0,) if they do not."""
+        del on_map
+        return np.zeros(0)
+
+    def bent(self, on_map: JointMap) -> Iterator[BentMap]:
+        """Yield the map where they bend it, if it is only scaled and they show that it drifts."""
+        del on_map
+        yield from ()
+
+    def sides(self, on_map: JointMap) -> Iterator[AnchorSides]:
+        """Yield on which sides of the path anchors stand whose places are not known, if they see such anchors."""
+        del on_map
+        yield from ()
+
+    def moved_ranges(self, known: Posterior, bent: FrameSteps) -> Iterator[tuple[Array, Indices, Array]]:
+        """Yield what changes where the map is bent, and moved to the estimate of a posterior, if they are ranges.
+
+        These are (m, 3) positions of anchors, (k,) rows of ranges, and (k,) by how much longer they are predicted.
+        """
+        del known, bent
+        yield from ()
 
     def against_others(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> tuple[MistakeTest, ...]:
         """Return the tests that compare the scale with that by each of the kinds before in the table."""
@@ -195,6 +235,21 @@ class KindOnMap(Located):
 
 
 _Kind = TypeVar("_Kind", bound=KindOnMap)
+
+
+class BentMap(NamedTuple):
+    """A map that is only scaled, where measurements bend it.
+
+    Attributes:
+        kind: the measurements on it. placed: the similarity that brings the map nearest to it.
+        posterior: what they say of it. doubts, remarks: as of ``KindOnMap``.
+    """
+
+    kind: KindOnMap
+    placed: Similarity
+    posterior: Posterior
+    doubts: tuple[Doubt, ...]
+    remarks: tuple[Doubt, ...]
 
 
 @dataclass(frozen=True)
@@ -255,6 +310,19 @@ class JointMap:
         """Return the map at rest without one component of the errors of a kind."""
         problem = self.problem.without(kind, name)
         return replace(self, problem=problem, posterior=problem.posterior(is_refined=True))
+
+    def of_log(self, before: RangeEstimate) -> RangeEstimate:
+        """Return what is said of the ranges of the log; what was known before if none takes part."""
+        for each in self.kinds:
+            before = each.of_log(before)
+        return before
+
+    def without_clocks(self) -> JointMap:
+        """Return the map at rest without the errors of clocks, which its fit has estimated."""
+        found = self
+        for each in self.kinds:
+            found = found.without(each.kind, each.clock) if each.clock else found
+        return found
 
     def concluded(self) -> JointMap:
         """Return the map with what it says of each kind."""

@@ -23,7 +23,6 @@ from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.pipeline.join_models import ModelVerdict
 from rangesfm.sfm.loops.loop_closure import LoopClosure
@@ -44,6 +43,9 @@ class Rivals(NamedTuple):
 
     doubts: tuple[str, ...]
     stddev: float
+
+
+NO_RIVALS = Rivals((), 0.0)
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,7 @@ class MetricResult:
         diagnosis: result of the tests of mistakes on the final map.
         tape: the measured lengths, with those left out that cannot be in the map; empty without any.
         positions: the known positions, with those left out that contradict the others.
-        rivals: other likely time offsets; None without any.
-        on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
+        rivals: other likely time offsets.
         at_refined: the map at rest with all that is measured in it, before it is moved to its estimate; None without
             a refinement.
         loops: the loops that were closed in the refined map; None where none were looked for.
@@ -90,8 +91,7 @@ class MetricResult:
     diagnosis: Diagnosis | None = None
     tape: Tape = field(default_factory=Tape)
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
-    rivals: Rivals | None = None
-    on_map: RangesOnMap | None = None
+    rivals: Rivals = NO_RIVALS
     at_refined: JointMap | None = None
     loops: LoopClosure | None = None
 

@@ -94,11 +94,13 @@ class MistakeTests:
         tests: rows of the table; what was found comes first.
         reasons: sentences, the likeliest cause first.
         hidden: mistakes that the tests may miss.
+        of_place: sentences of what makes the map's place doubtful.
     """
 
     tests: tuple[MistakeTest, ...] = ()
     reasons: tuple[str, ...] = ()
     hidden: tuple[HiddenMistake, ...] = ()
+    of_place: tuple[str, ...] = ()
 
 
 def row_of_mistake(

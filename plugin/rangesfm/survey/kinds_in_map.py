@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pycolmap
@@ -10,6 +10,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.refinement import MapAtRest
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
@@ -25,11 +26,13 @@ from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.cost import Ranges
+from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangesAtRest, RangeScale, RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
 from rangesfm.measurements.source import Source
+from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -155,12 +158,32 @@ def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located,
     return tuple(found), tuple(remarks)
 
 
-def sources_in_map(tape: Tape, on_map: JointMap | None, gravity: Gravity | None) -> tuple[Source, ...]:
-    """Return the measurements besides ranges for the fit of a map that may bend.
+def without_contradicted(inputs: RangingInputs, kinds: Sequence[KindOnMap]) -> RangingInputs:
+    """Return the inputs without those that contradict all else on a map."""
+    lengths, positions = find_kind(kinds, LengthScale), find_kind(kinds, PositionScale)
+    tape = inputs.tape.without([*(() if lengths is None else lengths.left_out)])
+    known = inputs.positions.without(() if positions is None else positions.names_left_out)
+    return replace(inputs, tape=tape, positions=known)
+
+
+def sources_in_map(ranges: Ranges, tape: Tape, on_map: JointMap | None, gravity: Gravity | None) -> tuple[Source, ...]:
+    """Return the measurements for the fit of a map that may bend.
 
     Args:
-        tape: lengths of all kinds. on_map: what is measured in the map as one piece; None where nothing is known.
+        ranges: of the log on the map. tape: lengths of all kinds.
+        on_map: what is measured in the map as one piece; None where nothing is known.
         gravity: the upward direction in the first camera; None where the map has no place in the site.
     """
     of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
-    return (TapedLengths(tape), *of_kinds, *(() if gravity is None else (Upwards(gravity),)))
+    return (RadioLog(ranges), TapedLengths(tape), *of_kinds, *(() if gravity is None else (Upwards(gravity),)))
+
+
+def ranges_in_map(inputs: RangingInputs, estimate: ScaleEstimate, path: Trajectory, options: RefineOptions) -> Ranges:
+    """Return the ranges of the log on a scaled map, with the errors that all other measurements may correct.
+
+    Args:
+        estimate: of the scale. path: of the unscaled model.
+    """
+    placed, arms_m = estimate.metric_from_sfm, inputs.tag_in_cam_m
+    found = ranges_of_map(path, estimate.observations, placed, arms_m, estimate.anchors, estimate.errors, options)
+    return replace(found, shared_errors_m=estimate.ranges.shared_errors_m)

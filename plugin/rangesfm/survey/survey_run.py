@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -13,9 +13,10 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.positions.clock import POSITIONS
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
+from rangesfm.measurements.ranges.clock.time_offset import REMEDY, estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
@@ -46,6 +47,20 @@ class PathOfModel:
     trajectory: Trajectory
     observations: RangeObservations
     time_offset: TimeOffset | None = None
+
+
+class Clock(NamedTuple):
+    """A clock with several likely time offsets.
+
+    Attributes:
+        whose: it is, in words. offset: of it, with its rivals. remedy: what the user can do.
+        estimate_at: returns the estimate at another offset, or raises GeometryError.
+    """
+
+    whose: str
+    offset: TimeOffset
+    remedy: str
+    estimate_at: Callable[[TimeOffset], ScaleEstimate]
 
 
 @dataclass(frozen=True)
@@ -134,6 +149,26 @@ class SurveyRun:
             raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
         begun = RangeEstimate.begun(log, self.survey.ranges)
         return estimate_scale(located, path.trajectory, bending, self.survey.scale, begun).remarked(remarks)
+
+    def clocks(self, path: PathOfModel) -> Iterator[Clock]:
+        """Yield the clocks of a model whose time offsets were searched for, and are not certain."""
+        offset, track, log = path.time_offset, self.inputs.positions.antenna, self.inputs.log
+
+        def at_ranges_offset(other: TimeOffset) -> ScaleEstimate:
+            assert log.timestamp_s is not None, "clocks belong to a log with times"
+            return self.estimate_scale(
+                replace(path, observations=self.ranges_on(path.trajectory, other.at(log.timestamp_s)))
+            )
+
+        def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
+            antenna = track and replace(track, offset_s=other.value_s)
+            positions = replace(self.inputs.positions, antenna=antenna)
+            return replace(self, inputs=replace(self.inputs, positions=positions)).estimate_scale(path)
+
+        if offset is not None and offset.rivals:
+            yield Clock("", offset, REMEDY, at_ranges_offset)
+        if track is not None and track.search is not None and track.search.rivals:
+            yield Clock(" of the positions", track.search, POSITIONS.remedy, at_positions_offset)
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_estimate import ScaleEstimate, told_of_ranges
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.scale.scale_verdict import judge_map_of_kinds
 from rangesfm.measurements.joint_map import (
     JointMap,
@@ -111,7 +111,7 @@ def estimate_scale(
         verdict=judged.verdict,
         reasons=judged.reasons,
         advice=judged.advice,
-        ranges=told_of_ranges(on_map, log),
+        ranges=on_map.of_log(log),
         on_map=on_map,
         placement=known.placement,
         by_kind=by_kind,
@@ -175,7 +175,7 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
         verdict="doubtful",
         reasons=("two-candidate, for comparison: nothing is known of its error", *robust.remarks),
         advice=("use the robust method",),
-        ranges=replace(robust.ranges, sensitivity=NOT_KNOWN, per_anchor={}),
+        ranges=replace(robust.ranges, median_off_m=np.nan, sensitivity=NOT_KNOWN, per_anchor={}),
         by_kind={},
         on_map=None,
         placement=None,

@@ -9,13 +9,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.scale_verdict import Verdict, judge_map_of_kinds
+from rangesfm.estimation.scale.scale_verdict import Verdict, judge, judge_map_of_kinds
 from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
-from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import ScaleOptions
@@ -95,6 +94,34 @@ class ScaleEstimate:
         """The paper's table; None where too few ranges have candidates."""
         return self.ranges.two_candidate
 
+    @property
+    def kinds(self) -> tuple[KindOnMap, ...]:
+        """The measurements from which it was computed."""
+        return () if self.on_map is None else self.on_map.kinds
+
+    def where_bent(self, options: ScaleOptions) -> ScaleEstimate:
+        """Return the estimate of a map that is not refined where measurements bend it, anchors on their likelier sides.
+
+        Raises:
+            GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+        """
+        found, on_map = self, self.on_map
+        if on_map is None:
+            return self
+        for each in on_map.kinds:
+            for bent in each.bent(on_map):
+                known = bent.posterior
+                found = found.judged(
+                    judge(bent.doubts, bent.remarks, known.uncertainty, options),
+                    metric_from_sfm=bent.placed,
+                    uncertainty=known.uncertainty,
+                    placement=known.placement,
+                    ranges=bent.kind.of_log(found.ranges),
+                )
+            for sides in each.sides(on_map):
+                found = found.with_anchors(sides.applied_to(found.anchors))
+        return found
+
     def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> ScaleEstimate:
         """Return the estimate with others of the anchors."""
         return replace(self, ranges=replace(self.ranges, anchors=anchors))
@@ -123,7 +150,7 @@ class ScaleEstimate:
         known = on_map.posterior
         return self.judged(
             judge_map_of_kinds(on_map, options),
-            ranges=told_of_ranges(on_map, self.ranges),
+            ranges=on_map.of_log(self.ranges),
             refined_value=on_map.scale.value,
             uncertainty=known.uncertainty,
             placement=known.placement,
@@ -154,9 +181,3 @@ class ScaleEstimate:
         """Return the scale with its interval and its verdict on one line."""
         low, high = self.interval_95
         return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"
-
-
-def told_of_ranges(on_map: JointMap, before: RangeEstimate) -> RangeEstimate:
-    """Return what a map says of the ranges; what was known of them before if they have no part in it."""
-    ranges = on_map.find(RangeScale)
-    return before if ranges is None else ranges.told

@@ -74,6 +74,7 @@ class PositionScale(KindOnMap):
     surveyed: SurveyedPositions = field(default_factory=SurveyedPositions)
 
     kind = POSITIONS
+    shows_bending = True
     words, remedy = "known positions", "look at the units of both"
 
     @property

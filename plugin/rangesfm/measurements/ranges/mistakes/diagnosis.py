@@ -49,10 +49,11 @@ class Diagnosis(MistakeTests):
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def with_more(self, more: MistakeTests) -> Diagnosis:
-        """Return the verdict with tests of something other than ranges added."""
+        """Return the verdict with tests of another kind added."""
         tests = (*more.tests, *self.tests)
         reasons, hidden = (*self.reasons, *more.reasons), (*self.hidden, *more.hidden)
-        return replace(self, tests=tests, reasons=reasons, hidden=hidden)
+        causes, rows = (more.causes, more.rows) if isinstance(more, Diagnosis) else (self.causes, self.rows)
+        return Diagnosis(tests, reasons, hidden, (*self.of_place, *more.of_place), causes, rows)
 
 
 @with_one_blas_thread
@@ -69,7 +70,10 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
     said = tuple(reasons or _what_could_hide(found))
-    return Diagnosis(rows, said, found.hidden, found.causes, on_map.posed.rows)
+    # The map is elsewhere, too, if the anchors are.
+    moves = any(cause.correction.anchors_m for cause in found.causes)
+    of_place = (causes_in_words(found.causes),) if moves else ()
+    return Diagnosis(rows, said, found.hidden, of_place, found.causes, on_map.posed.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

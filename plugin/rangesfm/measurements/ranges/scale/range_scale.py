@@ -9,13 +9,18 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, Located, join_kinds, upward_by
+from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.joint_map import BentMap, Doubt, JointMap, KindOnMap, Located, join_kinds, upward_by
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges, anchors_at
+from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
+from rangesfm.measurements.ranges.mistakes.anchor_sides import AnchorSides, likelier_sides
+from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges, drifts
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, linearized, ranges_on_map
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
 from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
@@ -40,9 +45,9 @@ from rangesfm.measurements.ranges.scale.solution import (
 )
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
 
 
@@ -67,7 +72,8 @@ class RangeScale(KindOnMap):
 
     kind = words = RANGES
     method = "robust"
-    is_solved = True
+    clock = CLOCKS
+    is_solved = shows_bending = True
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
 
     @property
@@ -157,6 +163,7 @@ class RangeScale(KindOnMap):
             replace(posed.observations, status=status),
             errors,
             solution.noise_stddev_m,
+            float(np.median(np.abs(solution.fit.residuals_m))),
             anchor_estimates(after.solution, log.anchor_ids, known.covariance),
             scale_per_anchor(solution, log.anchor_ids),
             scale_sensitivity(after.solution, posed, on_map.problem.of_kind(RANGES, known.gains), learned.bins),
@@ -175,6 +182,11 @@ class RangeScale(KindOnMap):
             return ()
         return levelled_places(given.gravity, given.anchors, found)
 
+    def of_log(self, before: RangeEstimate) -> RangeEstimate:
+        """Return what is said of the ranges."""
+        del before
+        return self.told
+
     def learnt(self, on_map: JointMap) -> LearnedErrors:
         """Return the errors of the ranges as learnt on a map, with those of the map."""
         observed = on_map.observed[RANGES]
@@ -184,6 +196,70 @@ class RangeScale(KindOnMap):
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return these for the ranges in a bundle adjustment."""
         return {"range": self.learnt(on_map)}
+
+    def on(self, on_map: JointMap) -> RangesOnMap:
+        """Return the ranges for tests: where they are on a map at rest, or where they bend one that is only scaled."""
+        return ranges_on_map(self.posed, self.solution, self.bending) if on_map.is_at_rest else self._where_bent.on_map
+
+    @cached_property
+    def _where_bent(self) -> AnchorSides:
+        here = ranges_on_map(self.posed, self.solution, self.bending)
+        return likelier_sides(bent_to_ranges(here, self.solution.rivals))
+
+    def sides(self, on_map: JointMap) -> Iterator[AnchorSides]:
+        """Yield on which sides of the path the unknown anchors stand."""
+        yield likelier_sides(self.on(on_map)) if on_map.is_at_rest else self._where_bent
+
+    def bends_m(self, on_map: JointMap) -> Array:
+        """Return how far the ranges bend each keyframe."""
+        return bends_m(self.on(on_map))
+
+    def bent(self, on_map: JointMap) -> Iterator[BentMap]:
+        """Yield the path bent to the ranges, if that is by more than the scatter of the ranges.
+
+        A rigid path fits as well otherwise.
+        """
+        bent, told = self.on(on_map), self.told
+        if not len(bent_by_m := bends_m(bent)):
+            return
+        problem = linearized(bent).with_learnt_errors()
+        if not drifts(problem):
+            return
+        weights, rows = problem.bins.robust_weight, self.posed.rows
+        known = Posterior.best(problem, problem.errors, on_map.posterior.uncertainty.formal)
+        solution = replace(self.solution, fit=replace(self.solution.fit, state=bent.state, weights=weights))
+        status, stddev_m = told.observations.status.copy(), told.errors.stddev_m.copy()
+        status[rows], stddev_m[rows] = status_by_weight(weights), problem.scatter_m
+        places = zip(told.anchors, bent.state.anchors_m, strict=True)
+        drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
+        remarks = (*remarks_on_anchors(solution, told.anchors), Doubt(drift))
+        told = replace(
+            told,
+            observations=replace(told.observations, status=status),
+            errors=replace(told.errors, stddev_m=stddev_m),
+            anchors=tuple(replace(anchor, position_m=at_m) for anchor, at_m in places),
+        )
+        placed = bent.state.metric_from_model @ self.posed.first_camera_from_sfm
+        doubts = tuple(doubts_of_ranges(self.posed, solution, known.uncertainty, {}))
+        yield BentMap(replace(self, told=told), placed, known, doubts, remarks)
+
+    def cause(self, on_map: JointMap) -> str:
+        """Return the likeliest mistake that the ranges show."""
+        try:
+            causes = diagnose_ranges(self.on(on_map), seed=self.posed.given.seed).causes
+        except np.linalg.LinAlgError:
+            return ""
+        return causes_in_words(causes) if causes else ""
+
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> Diagnosis:
+        """Return the tests of all mistakes that ranges can show."""
+        del by_kind
+        return diagnose_ranges(self.on(on_map), seed=self.posed.given.seed)
+
+    def moved_ranges(self, known: Posterior, bent: FrameSteps) -> Iterator[tuple[Array, Indices, Array]]:
+        """Yield the moved anchors, and by how much longer the ranges are."""
+        after = self.moved(known, bent)
+        yield after.solution.fit.state.anchors_m, after.posed.rows, after.predicted_m - self.predicted_m
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield the faults of the path, of the anchors and of the ranges."""

@@ -1,0 +1,195 @@
+"""Refinement of a scaled map by the options of a survey, and what is measured in the map at rest (sections 5 to 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Indices
+from rangesfm.colmap.reprojection import point_errors
+from rangesfm.diagnostics.finished_map import why_broken
+from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.map_problem import MapProblem, map_problem
+from rangesfm.estimation.photo_bending import by_photos
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.estimation.with_ranges import summarize
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds, upward_by
+from rangesfm.measurements.lengths.locate_lengths import surveyed_distances
+from rangesfm.measurements.source import Measured
+from rangesfm.pipeline.close_loops import RefinedMap
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.result.result_folder import is_refined_model
+from rangesfm.solver.bending import MapBending, WalkBending
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, ranges_in_map, sources_in_map
+from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.geometry.gravity import gravity_of
+from rangesfm.util.geometry.similarity import IDENTITY, align_points
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.processes.threads import at_most
+
+
+def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
+    """Refine a scaled map with all that was measured. Where that breaks the map, the scaled map stays the result.
+
+    Raises:
+        SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
+    """
+    run = _with_open_clock(run, metric)
+    measured = _measured(run, metric)
+    with at_most(run.survey.mapper.num_threads):
+        problem = _problem(run, metric, measured, metric.scaled, is_refined=is_refined_model(run.survey.images.model))
+        return _finished(run, metric, measured, refine(problem, measured.markers))
+
+
+def refine_closed_map(
+    run: SurveyRun, refined: RefinedMap, loops: LoopPoses, merge_tracks: Callable[[pycolmap.Reconstruction], None]
+) -> RefinedMap:
+    """Close the loops of a refined map, and refine it again.
+
+    Args:
+        loops: measured relative poses, by ids of frames. merge_tracks: makes one of points that two passes saw apart,
+            in place.
+
+    Raises:
+        SolverError: as for ``refine_map``.
+    """
+    metric, run = refined.metric, _with_open_clock(run, refined.metric)
+    measured = _measured(run, metric)
+    with at_most(run.survey.mapper.num_threads):
+        problem = _problem(run, metric, measured, metric.final, is_refined=True)
+        known = problem.like(refined.at_rest.problem)
+        rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
+        return _finished(run, metric, measured, rest)
+
+
+def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
+    """Return the survey with the time offset to be estimated where it is not certain."""
+    offset = metric.time_offset
+    if offset is None or offset.is_certain or run.survey.refine.time_offset_stddev_s:
+        return run
+    return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
+
+
+def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
+    """Return all that was measured of a scaled map."""
+    estimate, inputs, tape = metric.estimate, run.inputs, metric.tape
+    if inputs.anchor_frame == "site" and estimate.frame != "site":
+        # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
+        tape = tape.with_more(surveyed_distances(inputs.anchors))
+    gravity = gravity_of(run.survey.scale.up_in_first_camera)
+    upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
+    ranges = ranges_in_map(inputs, estimate.with_anchors(metric.anchors), metric.trajectory, run.survey.refine)
+    return Measured(sources_in_map(ranges, tape, estimate.on_map, upward))
+
+
+def _problem(
+    run: SurveyRun, metric: MetricResult, measured: Measured, model: pycolmap.Reconstruction, *, is_refined: bool
+) -> MapProblem:
+    survey = run.survey
+    return map_problem(
+        pycolmap.Reconstruction(model),
+        measured,
+        metric.trajectory,
+        camera=survey.camera,
+        options=survey.refine,
+        first_pose_is_fixed=metric.estimate.frame != "site",
+        is_refined=is_refined,
+        num_threads=survey.mapper.num_threads,
+    )
+
+
+def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
+    """Learn the errors at a map at rest, and return it as a result with its covariance."""
+    survey, estimate = run.survey, metric.estimate
+    at, factor = _measured_at_rest(run, metric, rest), 1.0
+    if at is not None:
+        if survey.refine.time_offset_stddev_s:
+            at = at.without_clocks()
+        factor = at.problem.bending_factor
+        at = at.concluded()
+        for kind in at.kinds:
+            rest = rest.with_learnt(kind.learnt_errors(at))
+    covariance = None
+    if survey.refine.covariance:
+        # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
+        covariance = joint_errors(rest, max(factor, 1.0))
+        if covariance is None:
+            run.journal.warn(
+                "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
+            )
+    refined = rest.problem.metric
+    refined.update_point_3d_errors()
+    summary = summarize(rest, measured, covariance, factor)
+    broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
+    if broken and not point_errors(metric.scaled).fit:
+        raise SolverError(
+            f"the refinement broke the map: {'; '.join(broken)}; nor do the points of the model before it fit the "
+            "photos: check that model, photos and camera parameters belong together (rangesfm scale gives the path "
+            "alone)"
+        )
+    return RefinedMap(
+        replace(metric, refined=refined, refinement=summary, why_broken=broken, at_refined=at),
+        rest,
+    )
+
+
+def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined: RefinedMap) -> RefinedMap:
+    """Return the refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
+
+    If that breaks the map, the first refinement stays.
+
+    Args:
+        start: the scaled map.
+    """
+    metric, estimate = refined.metric, start.estimate
+    refinement, at = metric.kept_refinement, metric.all_measured
+    if refinement is None or at is None:
+        return refined
+    for sides in (sides for each in at.kinds for sides in each.sides(at)):
+        estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
+        if sides.has_crossed:
+            again = refine_map(run, replace(start, estimate=estimate))
+            return refined if again.metric.kept_refinement is None else again
+        refinement = replace(refinement, anchors=sides.applied_to(refinement.anchors))
+    return replace(refined, metric=replace(metric, estimate=estimate, refinement=refinement))
+
+
+def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
+    """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
+    if rest.equations is not None:
+        try:
+            return by_photos(
+                rest.equations, rest.pixel_stddev_at_rest, path, metres_per_unit, rest.firm_ids, is_at_optimum=False
+            )
+        except GeometryError:
+            pass
+    return WalkBending(in_first_camera(path, metres_per_unit))
+
+
+def metres_per_unit_of(unscaled: Trajectory, path: Trajectory, firm_ids: Indices) -> float:
+    """Return the scale of the similarity that fits the centres of the firm frames of two paths best."""
+    is_firm = np.isin(path.frame_ids, firm_ids)
+    return align_points(unscaled.centers[is_firm], path.centers[is_firm]).scale
+
+
+def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
+    """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
+    start, model = metric.estimate.on_map, rest.problem.metric
+    if start is None:
+        return None
+    path = metric.trajectory.as_in(model)
+    scale = metres_per_unit_of(metric.trajectory, path, rest.firm_ids)
+    bending = _bending_at_rest(rest, path, scale)
+    inputs = replace(run.inputs, tape=metric.tape, positions=metric.positions)
+    of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
+    located, _ = kinds_in_map(inputs, of_model)
+    others = tested_kinds(
+        [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
+    )
+    joined = join_kinds(beside_others(located, others), path, IDENTITY, bending, is_at_rest=True)
+    return replace(joined, metres_per_unit=scale)
