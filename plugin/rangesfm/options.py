@@ -149,7 +149,7 @@ class CameraOptions(Options, table="camera"):
     """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
     as left*.jpg. One table may leave it out, for all other photos."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], KeyMeta(flag="camera_mode")] = "auto"
-    """Photos of one size that share a camera. auto: those with the same make, model, serial number and focal length in
+    """Photos of one size that have one camera. auto: those with the same make, model, serial number and focal length in
     EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
     model: Annotated[str | None, KeyMeta(flag="camera_model")] = None
     """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
@@ -264,17 +264,17 @@ class AssociationOptions(Options, table="ranges"):
 
 
 class CheckOptions(Options, table="ranges"):
-    """Ranges that are held out of every estimate and compared with the result (checks)."""
+    """Ranges that take no part in any estimate and are compared with the result (checks)."""
 
     check_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Fraction of the ranges that is held out as checks, chosen at random. This is the mildest check, because ranges
-    that are close in time have the same errors."""
+    """Fraction of the ranges that are checks, chosen at random, and take no part in the estimate. This is the mildest
+    check, because ranges that are close in time have the same errors."""
     check_anchors: _Texts = ()
-    """Ids of anchors with surveyed positions; all their ranges are held out."""
+    """Ids of anchors with surveyed positions; all their ranges are checks."""
     check_times_s: Annotated[
         _Times, AfterValidator(_span), KeyMeta(metavar="A,B", expected="two times in seconds, the later one last")
     ] = ()
-    """First and last time, on the radio's clock; the ranges between them are held out."""
+    """First and last time, on the radio's clock; the ranges between them are checks."""
 
 
 class RangeModelOptions(Options, table="ranges"):
@@ -286,11 +286,11 @@ class RangeModelOptions(Options, table="ranges"):
     """Standard deviation of the prior of each anchor's own constant bias, mean 0. It is small on purpose: a freer bias
     absorbs errors that depend on direction, and shifts the map."""
     common_bias_stddev_m: Uncertainty = 0.1
-    """Standard deviation of the prior of the bias that all anchors share (the tag's delay), mean 0."""
+    """Standard deviation of the prior of the bias that is common to all anchors (the tag's delay), mean 0."""
 
 
 class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOptions):
-    """The radio's log, assumptions about its errors, and ranges that are held out."""
+    """The radio's log, assumptions about its errors, and ranges that are checks."""
 
 
 class AnchorOptions(Options, table="anchors"):
@@ -318,8 +318,8 @@ class PointOptions(Options, table="points"):
 
     path: Annotated[Path | None, KeyMeta(flag="points", role="file", is_common=True)] = None
     """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, ODM's
-    gcp_list.txt, or Metashape's markers (XML). A control point holds the map, a check point is only compared with it.
-    The photos that show them are in the file of markers in [scale], in gcp_list.txt or Metashape's file, or found
+    gcp_list.txt, or Metashape's markers (XML). A control point determines the map, a check point is only compared with
+    it. The photos that show them are in the file of markers in [scale], in gcp_list.txt or Metashape's file, or found
     (printed tags)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="point_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for marker, x, y, z, stddev and kind; x is
@@ -500,8 +500,8 @@ class RefineOptions(Options, table="refine"):
     """Standard deviation of the time offset, which is refined unless it is 0. An offset that the search finds only
     roughly is refined in any case, with the standard deviation of the search."""
     short_range_stddev_m: Uncertainty = 0.0
-    """Standard deviation of an error of short ranges that all anchors share and that decays with a length of 1 m. It is
-    refined unless this is 0; with 0, short ranges get less weight instead."""
+    """Standard deviation of an error of short ranges that is common to all anchors and decays with a length of 1 m. It
+    is refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True
     """Compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that nearly all
     see the same, or for more than some 18 000 over a field with loops everywhere; along a path it can be computed for

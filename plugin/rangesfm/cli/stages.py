@@ -60,7 +60,7 @@ def add_stages_commands(commands: Commands) -> None:
     of_loops = ("mapper.database_path", "mapper.close_loops")
     add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", *of_loops, "refine")
     join = commands.add(
-        "join", _join, "join several surveys of one site to one metric map, through the anchors that they share"
+        "join", _join, "join several surveys of one site to one metric map, through their common anchors"
     )
     join.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
     add_flags(join, *_JOIN_KEYS, without=("scale.up_in_first_camera", "scale.distances", "scale.markers"))
@@ -162,9 +162,9 @@ def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Join the results of surveys that share anchors to one map with one set of anchors. The surveys may be of
-    different days, or of different cameras with their own tags; they need no common photos. The map is in the frame
-    of the first one. Anchors need not be surveyed: then each survey must share three or more with the others, not
+    """Join the results of surveys with common anchors to one map with one set of anchors. The surveys may be of
+    different days, or of different cameras with their own tags; they need no common photos. The map is in the frame of
+    the first one. Anchors need not be surveyed: then each survey must have three or more in common with the others, not
     on a line.
 
     example:
