@@ -118,6 +118,7 @@ class Scene:
         return RangeProblem(
             self.observations.centers, self.observations.tag_from_center, self.log.anchor_index, self.log.range_m,
             np.ones(len(self.log)), self.anchors_m, known, np.zeros(3), known, 0.1, frame_is_free=True,
+            share=np.ones(len(self.log)),
         )  # fmt: skip
 
     @property

@@ -168,7 +168,7 @@ def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_
     models = [
         ScaledModel(part.trajectory, known(verdict.estimate), is_in_anchor_frame=False) for part, verdict in pairs
     ]
-    again = known(place_models(models).first_from_sfm[1])
+    again = known(place_models(models)[0][1])
     assert again.scale == pytest.approx(known(joined.verdicts[1].joined_from_sfm).scale, rel=1e-6)
 
 

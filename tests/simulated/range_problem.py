@@ -36,6 +36,7 @@ def range_problem(
         centers=centers,
         range_m=np.ones(num) if range_m is None else range_m,
         stddev_m=np.broadcast_to(stddev_m, num).astype(np.float64),
+        share=np.ones(num),
         anchor_mean_m=anchors_m,
         **{**given, **others},
     )

@@ -14,6 +14,7 @@ from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
@@ -96,7 +97,7 @@ def run(survey: MadeSurvey, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(survey, None, None, refusal=str(error))
-    ranges, on_map = estimate.find(RangeScale), estimate.on_map
+    ranges, on_map = find_kind(estimate.kinds, RangeScale), estimate.on_map
     assert ranges is not None
     assert on_map is not None
     return Run(survey, estimate.where_bent(options), ranges.tests(on_map, {}), ranges.on(on_map))

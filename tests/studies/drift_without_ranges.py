@@ -44,6 +44,7 @@ from tests.studies.measured_distances import marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import RangesfmError
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
@@ -184,7 +185,7 @@ def told(kind: str, seed: int) -> Line:
         return {**line, "refused": str(error)}
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
     estimate, kept = metric.estimate, metric.kept_refinement is not None
-    positions, lengths = estimate.find(PositionScale), estimate.find(LengthScale)
+    positions, lengths = find_kind(estimate.kinds, PositionScale), find_kind(estimate.kinds, LengthScale)
     low, high = estimate.interval_95
     off_m, variances = final_m - survey.true_centers_m, metric.center_covariance_m2
     line |= {

@@ -49,6 +49,7 @@ from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, 
 from tests.studies.measured_distances import KINDS
 
 import rangesfm
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale
@@ -229,7 +230,7 @@ def tables_of(metric: MetricResult) -> Values:
 def range_equations_of(metric: MetricResult) -> Values:
     """Return residuals of ranges, their derivatives by the map as a whole and the anchors, and the same of priors."""
     on_map = metric.all_measured
-    if on_map is None or (ranges := on_map.find(RangeScale)) is None:
+    if on_map is None or (ranges := find_kind(on_map.kinds, RangeScale)) is None:
         return {}
     moved = ranges.moved(on_map.posterior) if on_map.is_at_rest else ranges
     problem = linearized(moved.on(on_map)).with_learnt_errors()
@@ -244,7 +245,7 @@ def range_equations_of(metric: MetricResult) -> Values:
 
 def position_equations_of(metric: MetricResult) -> Values:
     """Return residuals of positions and control points, their derivatives by the map as a whole, and their errors."""
-    found, on_map = metric.find(PositionScale), metric.all_measured
+    found, on_map = find_kind(metric.kinds, PositionScale), metric.all_measured
     if found is None or on_map is None:
         return {}
     problem = on_map.problem
@@ -258,7 +259,7 @@ def position_equations_of(metric: MetricResult) -> Values:
 
 def length_equations_of(metric: MetricResult) -> Values:
     """Return residuals of measured lengths, derivatives of the scale by them, and their errors."""
-    found = metric.find(LengthScale)
+    found = find_kind(metric.kinds, LengthScale)
     if found is None:
         return {}
     return {
@@ -292,7 +293,7 @@ def covariances_of(metric: MetricResult) -> Values:
     found["scale half width"] = np.array(uncertainty.half_width_95)
     if metric.estimate.placement is not None:
         found["covariance placement"] = metric.estimate.placement
-    if metric.find(PositionScale) is not None and metric.all_measured is not None:
+    if find_kind(metric.kinds, PositionScale) is not None and metric.all_measured is not None:
         found["covariance by positions"] = metric.all_measured.posterior.place
     joint = None if metric.kept_refinement is None else metric.kept_refinement.covariance
     if joint is not None:

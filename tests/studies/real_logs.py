@@ -33,6 +33,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.association import associate
@@ -207,7 +208,7 @@ def one_survey(
 
 def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
     """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
-    ranges, on_map = found.find(RangeScale), found.on_map
+    ranges, on_map = find_kind(found.kinds, RangeScale), found.on_map
     assert ranges is not None
     assert on_map is not None
     return found.where_bent(options), [cause.words for cause in ranges.tests(on_map, {}).causes]

@@ -184,11 +184,6 @@ class KindOnMap(Located):
         reasons = tuple(f"{row.words}: {row.remedy}" for row in against if row.rejected)
         return MistakeTests(against, reasons, of_place=reasons if self.places_map else ())
 
-    def cause(self, on_map: JointMap) -> str:
-        """Return their likeliest mistake, with its remedy, where a map is refused; empty if there is none."""
-        del on_map
-        return ""
-
     def bends_m(self, on_map: JointMap) -> Array:
         """Return (n,) how far they bend each keyframe of a map that is only scaled; (0,) if they do not."""
         del on_map
@@ -291,10 +286,6 @@ class JointMap:
     def uncertainty(self) -> ScaleUncertainty:
         """Uncertainty of the scale."""
         return self.posterior.uncertainty
-
-    def find(self, kind: type[_Kind]) -> _Kind | None:
-        """Return the measurements of a kind; None without any."""
-        return find_kind(self.kinds, kind)
 
     def columns(self, kind: str, of_kind: Array) -> Array:
         """Return the columns (c, m) of the problem by those (k, m) of the observations of one kind."""

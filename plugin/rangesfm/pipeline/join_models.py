@@ -73,12 +73,12 @@ def join_models(run: SurveyRun, parts: Sequence[PathOfModel]) -> JoinedModels:
             if k == 0:
                 raise
             reasons[k] = str(error)
-    placements = place_models(list(scaled.values()))
-    reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
+    places, why_not, notes = place_models(list(scaled.values()))
+    reasons |= {k: reason for k, reason in zip(scaled, why_not, strict=True) if reason}
     if first in reasons and run.inputs.anchor_frame == "first_camera":
         why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has that photo, "
         reasons = {k: reasons.get(k, f"{why}cannot be placed") for k in range(1, len(parts))}
-    first_from_sfm = dict(zip(scaled, placements.first_from_sfm, strict=True))
+    first_from_sfm = dict(zip(scaled, places, strict=True))
     placed = {k: motion for k, motion in first_from_sfm.items() if motion is not None and k not in reasons}
     verdicts = (
         ModelVerdict(
@@ -91,7 +91,7 @@ def join_models(run: SurveyRun, parts: Sequence[PathOfModel]) -> JoinedModels:
         for k, part in enumerate(parts)
     )
     path = assembled([parts[k] for k in placed], list(placed.values()))
-    return JoinedModels(path, tuple(verdicts), placements.notes)
+    return JoinedModels(path, tuple(verdicts), notes)
 
 
 def _first_in_time(parts: Sequence[PathOfModel]) -> int:

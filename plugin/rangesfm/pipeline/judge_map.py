@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -75,8 +76,7 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     if not metric.final.num_points3D():
         return ()
     estimate, refinement = metric.estimate, metric.kept_refinement
-    on_map = metric.all_measured
-    is_learnt = on_map is not None and any(each.shows_bending for each in on_map.kinds)
+    is_learnt = any(each.shows_bending for each in metric.kinds)
     factor = refinement.bending_factor if refinement is not None and is_learnt else None
     doubt = doubt_of_lens(fit_lens(metric.final), factor, estimate.uncertainty.half_width_95)
     return () if doubt is None else (doubt,)
@@ -147,7 +147,9 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
         else:
             if start.method != "two-candidate":  # which has no interval
                 refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
-            estimate = replace(start, refined_value=None if metric.kept_refinement is None else metric.refined_scale)
+            estimate = start
+            if metric.kept_refinement is not None and metric.refined_scale is not None:
+                estimate = replace(start, value=metric.refined_scale)
     except GeometryError as error:
         raise with_cause(error, at) from None
     if metric.rivals.doubts:
@@ -157,5 +159,10 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
 
 def with_cause(error: GeometryError, on_map: JointMap | None) -> GeometryError:
     """Return a refusal with the likeliest mistakes that the measurements on its map show."""
-    causes = [] if on_map is None else [*filter(None, (each.cause(on_map) for each in on_map.kinds))]
-    return GeometryError(f"{error}; {'; '.join(causes)}") if causes else error
+    if on_map is None:
+        return error
+    causes = []
+    for each in on_map.kinds:
+        with contextlib.suppress(np.linalg.LinAlgError):  # they determine too little for tests
+            causes.append(each.tests(on_map, {}).likeliest)
+    return GeometryError("; ".join([str(error), *filter(None, causes)])) if any(causes) else error

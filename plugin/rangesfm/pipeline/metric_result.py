@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -29,8 +29,6 @@ from rangesfm.sfm.loops.loop_closure import LoopClosure
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import Similarity, align_points
 from rangesfm.util.geometry.trajectory import Trajectory
-
-_Kind = TypeVar("_Kind", bound=KindOnMap)
 
 
 class Rivals(NamedTuple):
@@ -113,9 +111,10 @@ class MetricResult:
         """
         return (self.at_refined if self.kept_refinement is not None else None) or self.estimate.on_map
 
-    def find(self, kind: type[_Kind]) -> _Kind | None:
-        """Return the measurements of a kind on that map; None without any."""
-        return None if self.all_measured is None else self.all_measured.find(kind)
+    @property
+    def kinds(self) -> tuple[KindOnMap, ...]:
+        """Return the measurements on that map."""
+        return () if self.all_measured is None else self.all_measured.kinds
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:

@@ -17,17 +17,16 @@ from rangesfm.estimation.photo_bending import by_photos
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds, upward_by
-from rangesfm.measurements.lengths.locate_lengths import surveyed_distances
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
 from rangesfm.measurements.source import Measured
 from rangesfm.pipeline.close_loops import RefinedMap
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
-from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, ranges_in_map, sources_in_map
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import at_most
@@ -77,14 +76,13 @@ def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
 
 def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
     """Return all that was measured of a scaled map."""
-    estimate, inputs, tape = metric.estimate, run.inputs, metric.tape
-    if inputs.anchor_frame == "site" and estimate.frame != "site":
-        # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
-        tape = tape.with_more(surveyed_distances(inputs.anchors))
-    gravity = gravity_of(run.survey.scale.up_in_first_camera)
-    upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
-    ranges = ranges_in_map(inputs, estimate.with_anchors(metric.anchors), metric.trajectory, run.survey.refine)
-    return Measured(sources_in_map(ranges, tape, estimate.on_map, upward))
+    estimate = metric.estimate.with_anchors(metric.anchors)
+    return measured_in_map(_inputs(run, metric), run.survey, estimate, metric.trajectory)
+
+
+def _inputs(run: SurveyRun, metric: MetricResult) -> RangingInputs:
+    """Return the inputs without those that contradict all else."""
+    return replace(run.inputs, tape=metric.tape, positions=metric.positions)
 
 
 def _problem(
@@ -185,9 +183,8 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> 
     path = metric.trajectory.as_in(model)
     scale = metres_per_unit_of(metric.trajectory, path, rest.firm_ids)
     bending = _bending_at_rest(rest, path, scale)
-    inputs = replace(run.inputs, tape=metric.tape, positions=metric.positions)
     of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
-    located, _ = kinds_in_map(inputs, of_model)
+    located, _ = kinds_in_map(_inputs(run, metric), of_model)
     others = tested_kinds(
         [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
     )

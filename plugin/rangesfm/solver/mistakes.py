@@ -94,12 +94,14 @@ class MistakeTests:
         tests: rows of the table; what was found comes first.
         reasons: sentences, the likeliest cause first.
         hidden: mistakes that the tests may miss.
+        likeliest: sentence on the likeliest mistake, with its remedy; empty if none shows.
         of_place: sentences of what makes the map's place doubtful.
     """
 
     tests: tuple[MistakeTest, ...] = ()
     reasons: tuple[str, ...] = ()
     hidden: tuple[HiddenMistake, ...] = ()
+    likeliest: str = ""
     of_place: tuple[str, ...] = ()
 
 

@@ -14,13 +14,12 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, Located, find_kind
+from rangesfm.measurements.joint_map import KindOnMap, Located, find_kind, upward_by
 from rangesfm.measurements.kind import Block
 from rangesfm.measurements.lengths.cost import TapedLengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances
-from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances, surveyed_distances
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
@@ -31,13 +30,12 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangesAtRest, RangeScale, RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
-from rangesfm.measurements.source import Source
+from rangesfm.measurements.source import Measured
 from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.util.geometry.gravity import Gravity, gravity_of
-from rangesfm.util.geometry.similarity import IDENTITY
+from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -91,7 +89,7 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
         known,
         at.path,
         at.bending,
-        refined=IDENTITY if at.before else None,
+        is_at_rest=bool(at.before),
         lasting_s=surveyed.lasting_s,
         metres_per_unit=at.metres_per_unit,
     )
@@ -166,16 +164,21 @@ def without_contradicted(inputs: RangingInputs, kinds: Sequence[KindOnMap]) -> R
     return replace(inputs, tape=tape, positions=known)
 
 
-def sources_in_map(ranges: Ranges, tape: Tape, on_map: JointMap | None, gravity: Gravity | None) -> tuple[Source, ...]:
-    """Return the measurements for the fit of a map that may bend.
+def measured_in_map(inputs: RangingInputs, survey: Survey, estimate: ScaleEstimate, path: Trajectory) -> Measured:
+    """Return all that was measured of a scaled map, for the fit of a map that may bend.
 
     Args:
-        ranges: of the log on the map. tape: lengths of all kinds.
-        on_map: what is measured in the map as one piece; None where nothing is known.
-        gravity: the upward direction in the first camera; None where the map has no place in the site.
+        inputs: without those that contradict all else. estimate: of the scale. path: of the unscaled model.
     """
+    tape, gravity, on_map = inputs.tape, gravity_of(survey.scale.up_in_first_camera), estimate.on_map
+    if inputs.anchor_frame == "site" and estimate.frame != "site":
+        # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
+        tape = tape.with_more(surveyed_distances(inputs.anchors))
     of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
-    return (RadioLog(ranges), TapedLengths(tape), *of_kinds, *(() if gravity is None else (Upwards(gravity),)))
+    upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
+    levelled = () if upward is None else (Upwards(upward),)
+    ranges = ranges_in_map(inputs, estimate, path, survey.refine)
+    return Measured((RadioLog(ranges), TapedLengths(tape), *of_kinds, *levelled))
 
 
 def ranges_in_map(inputs: RangingInputs, estimate: ScaleEstimate, path: Trajectory, options: RefineOptions) -> Ranges:

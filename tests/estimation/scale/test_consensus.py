@@ -39,6 +39,7 @@ def known_anchors(survey: Survey, range_m: Array | None = None) -> RangeProblem:
         bias_stddev_m=np.zeros(len(anchors)),
         common_bias_stddev_m=0.0,
         frame_is_free=False,
+        share=np.ones(len(observations.log)),
     )
 
 

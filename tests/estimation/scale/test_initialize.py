@@ -19,7 +19,7 @@ from tests.simulated.positions_at_origin import known_positions
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.measurements.joint_map import KindOnMap
+from rangesfm.measurements.joint_map import KindOnMap, find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.known_positions import KnownPositions
@@ -405,7 +405,10 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
     # The judged problem holds the scale no better than the lengths do in a map that bends.
-    lengths, posed = known(held.find(LengthScale)), known(held.find(RangeScale)).posed.ranges.distances
+    lengths, posed = (
+        known(find_kind(held.kinds, LengthScale)),
+        known(find_kind(held.kinds, RangeScale)).posed.ranges.distances,
+    )
     assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
 
 
@@ -416,7 +419,7 @@ def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wr
     mistyped = replace(distances, distance_m=distances.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
     found = survey.scale("unknown", distances=mistyped)
     low, high = found.interval_95
-    np.testing.assert_array_equal(known(found.find(LengthScale)).is_kept, np.arange(2) != wrong)
+    np.testing.assert_array_equal(known(find_kind(found.kinds, LengthScale)).is_kept, np.arange(2) != wrong)
     assert low < survey.truth("first_camera").scale < high
     assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
 

@@ -54,6 +54,7 @@ def random_problem(rng: np.random.Generator, state: RangeState) -> RangeProblem:
         bias_stddev_m=np.array([0.02, 0.1, 0.3]),
         common_bias_stddev_m=0.2,
         frame_is_free=True,
+        share=np.ones(NUM_RANGES),
     )
     return replace(problem, range_m=predicted_ranges(problem, state))
 
@@ -80,6 +81,7 @@ def test_prediction_is_the_hand_computed_one() -> None:
         bias_stddev_m=np.zeros(1),
         common_bias_stddev_m=0.0,
         frame_is_free=False,
+        share=np.ones(1),
     )
     state = RangeState(
         Similarity(2.0, quarter_turn, np.array([1.0, 0.0, 0.0])), problem.anchor_mean_m, np.array([0.25])

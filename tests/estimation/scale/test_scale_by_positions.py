@@ -47,7 +47,7 @@ def survey(is_mark: list[bool], noise_m: float = 0.0, stddev_m: float = 0.1, see
 
 
 def search(positions: KnownPositions) -> _Search:
-    return _Search(positions, path(), None, (), 1.0)
+    return _Search(positions, path(), False, (), 1.0)
 
 
 def finite_differences(positions: KnownPositions) -> Array:
@@ -77,7 +77,8 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    fit = search(wrong).fit(used)
+    searched = search(wrong)
+    fit = searched.fit(used, searched.start(used))
     assert_same(fit.similarity, SITE_FROM_MODEL)
     np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(fit.stddev_m, 0.1)

@@ -105,6 +105,7 @@ def estimate_scale(
     used = [each for each in on_map.kinds if each.is_used]
     estimate = ScaleEstimate(
         on_map.estimate,
+        on_map.estimate.scale,
         frame="site" if place_first(used).places_map else "first_camera",
         method=used[0].method,
         uncertainty=known.uncertainty,
@@ -170,6 +171,7 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
     return replace(
         robust,
         metric_from_sfm=replace(robust.metric_from_sfm, scale=table.scale),
+        value=table.scale,
         method="two-candidate",
         uncertainty=ScaleUncertainty(np.inf, {}),
         verdict="doubtful",

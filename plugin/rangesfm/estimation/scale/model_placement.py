@@ -43,27 +43,18 @@ class ScaledModel:
     frame_is_given: bool = False
 
 
-@dataclass(frozen=True)
-class Placements:
-    """Places of the models in the unscaled world of the first.
-
-    Attributes:
-        first_from_sfm: for each model; None if it could not be placed.
-        reasons: for each model, why it could not be placed; empty if it was.
-        notes: what does not fit.
-    """
-
-    first_from_sfm: tuple[Similarity | None, ...]
-    reasons: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-def place_models(models: Sequence[ScaledModel]) -> Placements:
+def place_models(
+    models: Sequence[ScaledModel],
+) -> tuple[tuple[Similarity | None, ...], tuple[str, ...], tuple[str, ...]]:
     """Place each model that the anchors determine in the world of the first, directly or through other models.
 
     Every model has a scale and a place of its own; all share one set of anchors. Where the anchors alone allow several
     places for a model, the ranges of all models decide; if they cannot, the model is left out. Each range keeps the
     weight that it has in its model alone.
+
+    Returns:
+        For each model its place in the unscaled world of the first, None if it could not be placed; for each model why
+        it could not, or an empty text; and what does not fit.
     """
     world = _World(models)
     reasons = [""] * len(models)
@@ -81,7 +72,7 @@ def place_models(models: Sequence[ScaledModel]) -> Placements:
     metric_from_sfm = world.solved()
     into_first = metric_from_sfm[0].inverse()
     placed = tuple(into_first @ metric_from_sfm[k] if k in metric_from_sfm else None for k in range(len(models)))
-    return Placements(placed, tuple(reasons), tuple(world.notes))
+    return placed, tuple(reasons), tuple(world.notes)
 
 
 class _World:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,14 @@ from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.similarity import Similarity
 
-_Kind = TypeVar("_Kind", bound=KindOnMap)
-
 
 @dataclass(frozen=True)
 class ScaleEstimate:
     """The scale, its frame and its uncertainty.
 
     Attributes:
-        metric_from_sfm: similarity from the world of the unscaled model to the metric world.
+        metric_from_sfm: similarity from the world of the unscaled model to the metric world, before a refinement.
+        value: scale of the delivered map, in metres per SfM unit, to which the uncertainty refers.
         frame: the metric world: "site" or "first_camera".
         method: "robust", "two-candidate", or without ranges the first kind of measurement, such as "positions".
         uncertainty: relative standard deviations of the scale; infinite with two-candidate, which does not tell.
@@ -41,11 +40,11 @@ class ScaleEstimate:
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
         remarks: those of the reasons that a refinement does not change.
-        refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
         by_kind: scale by each kind of measurement alone, such as "ranges"; empty where one gave place and scale.
     """
 
     metric_from_sfm: Similarity
+    value: float
     frame: str
     method: str
     uncertainty: ScaleUncertainty
@@ -57,7 +56,6 @@ class ScaleEstimate:
     placement: Array | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    refined_value: float | None = None
 
     @property
     def observations(self) -> RangeObservations:
@@ -114,6 +112,7 @@ class ScaleEstimate:
                 found = found.judged(
                     judge(bent.doubts, bent.remarks, known.uncertainty, options),
                     metric_from_sfm=bent.placed,
+                    value=bent.placed.scale,
                     uncertainty=known.uncertainty,
                     placement=known.placement,
                     ranges=bent.kind.of_log(found.ranges),
@@ -125,10 +124,6 @@ class ScaleEstimate:
     def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> ScaleEstimate:
         """Return the estimate with others of the anchors."""
         return replace(self, ranges=replace(self.ranges, anchors=anchors))
-
-    def find(self, kind: type[_Kind]) -> _Kind | None:
-        """Return the measurements of a kind that took part, or were tested; None without any."""
-        return None if self.on_map is None else self.on_map.find(kind)
 
     def remarked(self, remarks: tuple[str, ...]) -> ScaleEstimate:
         """Return the estimate with more remarks."""
@@ -151,15 +146,10 @@ class ScaleEstimate:
         return self.judged(
             judge_map_of_kinds(on_map, options),
             ranges=on_map.of_log(self.ranges),
-            refined_value=on_map.scale.value,
+            value=on_map.scale.value,
             uncertainty=known.uncertainty,
             placement=known.placement,
         )
-
-    @property
-    def value(self) -> float:
-        """Scale of the delivered map, in metres per SfM unit."""
-        return self.metric_from_sfm.scale if self.refined_value is None else self.refined_value
 
     @property
     def stddev_formal(self) -> float:

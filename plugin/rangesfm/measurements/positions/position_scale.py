@@ -210,7 +210,7 @@ def scale_by_positions(
     path: Trajectory,
     bending: MapBending,
     *,
-    refined: Similarity | None = None,
+    is_at_rest: bool = False,
     lasting_s: Sequence[float] = LASTING_S,
     metres_per_unit: float = 1.0,
 ) -> PositionScale:
@@ -218,7 +218,7 @@ def scale_by_positions(
 
     Args:
         known: positions in the model of ``path``. path: of the camera. bending: of the map.
-        refined: similarity of a map that photos and positions made together; None: the map is one piece, and its
+        is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
             similarity is estimated.
         lasting_s: for how long errors of the antenna's positions last, seconds.
         metres_per_unit: as of ``PositionFit``.
@@ -226,16 +226,15 @@ def scale_by_positions(
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    search = _Search(known, path, refined, tuple(lasting_s), metres_per_unit)
+    search = _Search(known, path, is_at_rest, tuple(lasting_s), metres_per_unit)
     search.require_enough()
     used = ~known.is_check
     num_control = int(np.count_nonzero(known.is_mark & used))
     threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(num_control, 1)))
-    learnt = search.learnt(bending, used)
+    learnt = search.learnt(bending, used, search.start(used))
     while (worst := search.worst(bending, learnt, threshold)) is not None:
         learnt = worst
     fit, observed, problem = learnt
-    is_at_rest = refined is not None
     posterior = problem.posterior(is_refined=is_at_rest)
     alone = JointMap((), path, fit.similarity, bending, is_at_rest, {POSITIONS: observed}, problem, posterior)
     refuse_open_turn(posterior.place)
@@ -273,7 +272,7 @@ class _Search:
 
     known: KnownPositions
     path: Trajectory
-    refined: Similarity | None
+    is_at_rest: bool
     lasting_s: tuple[float, ...]
     metres_per_unit: float
 
@@ -284,16 +283,19 @@ class _Search:
             expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
             raise GeometryError(f"{np.count_nonzero(is_control)} known positions are in the map, {expected}")
 
-    def fit(self, used: Mask, start: Similarity | None = None) -> PositionFit:
+    def start(self, used: Mask) -> Similarity:
+        """Return a similarity that few wrong positions do not move; that of a map at rest."""
+        return IDENTITY if self.is_at_rest else _of_triples(self.known, np.flatnonzero(used))
+
+    def fit(self, used: Mask, start: Similarity) -> PositionFit:
         """Fit the similarity by iteratively reweighted least squares."""
-        known = self.known
-        similarity = self.refined or start or _of_triples(known, np.flatnonzero(used))
+        known, similarity = self.known, start
         for _ in range(MAX_NUM_ROUNDS):
             off_m = known.misclosures_m(similarity)
             stddev_m = self._stddevs_m(off_m, used)
             away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
             weights = used * CAUCHY.weights(away)
-            if self.refined is not None:  # the map has its place; only outliers are told apart
+            if self.is_at_rest:  # the map has its place; only outliers are told apart
                 break
             step = self._step(similarity, off_m, weights / stddev_m**2)
             similarity = moved_similarity(similarity, step, self.path)
@@ -301,7 +303,7 @@ class _Search:
                 break
         return PositionFit(similarity, known, self.path, used, weights, stddev_m, self.lasting_s, self.metres_per_unit)
 
-    def learnt(self, bending: MapBending, used: Mask, start: Similarity | None = None) -> _Learnt:
+    def learnt(self, bending: MapBending, used: Mask, start: Similarity) -> _Learnt:
         """Return the fit with what is learnt from it."""
         fit = self.fit(used, start)
         observed = fit.at(fit.similarity)
@@ -358,9 +360,9 @@ def planned_positions(
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    search = _Search(known, path, IDENTITY, tuple(lasting_s), 1.0)
+    search = _Search(known, path, True, tuple(lasting_s), 1.0)
     search.require_enough()
-    return search.fit(~known.is_check).at(IDENTITY, max_num)
+    return search.fit(~known.is_check, IDENTITY).at(IDENTITY, max_num)
 
 
 def _determine(known: KnownPositions, used: Mask) -> bool:

@@ -52,8 +52,9 @@ class Diagnosis(MistakeTests):
         """Return the verdict with tests of another kind added."""
         tests = (*more.tests, *self.tests)
         reasons, hidden = (*self.reasons, *more.reasons), (*self.hidden, *more.hidden)
+        likeliest, of_place = self.likeliest or more.likeliest, (*self.of_place, *more.of_place)
         causes, rows = (more.causes, more.rows) if isinstance(more, Diagnosis) else (self.causes, self.rows)
-        return Diagnosis(tests, reasons, hidden, (*self.of_place, *more.of_place), causes, rows)
+        return Diagnosis(tests, reasons, hidden, likeliest, of_place, causes, rows)
 
 
 @with_one_blas_thread
@@ -67,13 +68,14 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
     rows = (*before, *map(_row_of_cause, found.causes), *seen, *others, *(row for row in shown if not row.rejected))
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *seen)]
-    if found.causes:
-        reasons.insert(len(before), causes_in_words(found.causes))
+    likeliest = causes_in_words(found.causes) if found.causes else ""
+    if likeliest:
+        reasons.insert(len(before), likeliest)
     said = tuple(reasons or _what_could_hide(found))
     # The map is elsewhere, too, if the anchors are.
     moves = any(cause.correction.anchors_m for cause in found.causes)
-    of_place = (causes_in_words(found.causes),) if moves else ()
-    return Diagnosis(rows, said, found.hidden, of_place, found.causes, on_map.posed.rows)
+    of_place = (likeliest,) if moves else ()
+    return Diagnosis(rows, said, found.hidden, likeliest, of_place, found.causes, on_map.posed.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

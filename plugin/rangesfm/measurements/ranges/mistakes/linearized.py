@@ -116,7 +116,7 @@ def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending |
     """Collect the ranges of a problem at its solution."""
     return RangesOnMap(
         posed=posed,
-        problem=replace(posed.ranges, stddev_m=np.ones(len(posed.rows)), share=None),
+        problem=replace(posed.ranges, stddev_m=np.ones(len(posed.rows)), share=np.ones(len(posed.rows))),
         state=solution.fit.state,
         model_from_cam=posed.model_from_cam,
         velocity=posed.velocity,

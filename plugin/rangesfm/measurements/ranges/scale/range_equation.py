@@ -48,10 +48,10 @@ class RangeProblem:
         bias_mean_m, bias_stddev_m: (m,) prior of each bias; standard deviation 0 fixes it.
         common_bias_stddev_m: prior of the bias that all free biases share, such as the tag's own delay.
         frame_is_free: whether rotation and translation are estimated; otherwise they stay as started.
+        share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike.
         gravity: the upward direction, if given and the frame is free; None otherwise.
         placement: what known positions say of the frame, if it is free; None without any.
         distances: measured ones to fit; they refer to anchors by index, like ``anchor_index``.
-        share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike; None: 1.
     """
 
     centers: Array
@@ -65,10 +65,10 @@ class RangeProblem:
     bias_stddev_m: Array
     common_bias_stddev_m: float
     frame_is_free: bool
+    share: Array
     distances: LocatedDistances = NO_DISTANCES
     gravity: Gravity | None = None
     placement: PlacementPrior | None = None
-    share: Array | None = None
 
     @property
     def num_anchors(self) -> int:
@@ -108,7 +108,7 @@ class RangeProblem:
             anchor_index=self.anchor_index[rows],
             range_m=self.range_m[rows],
             stddev_m=self.stddev_m[rows],
-            share=None if self.share is None else self.share[rows],
+            share=self.share[rows],
         )
 
     def by_some(self, rows: Indices) -> RangeProblem:
@@ -119,8 +119,7 @@ class RangeProblem:
         """
         part = self.subset(rows)
         num, taken = (np.bincount(each.anchor_index, minlength=self.num_anchors) for each in (self, part))
-        share = np.ones(len(rows)) if part.share is None else part.share
-        return replace(part, share=share * (num / np.maximum(taken, 1))[part.anchor_index])
+        return replace(part, share=part.share * (num / np.maximum(taken, 1))[part.anchor_index])
 
     def of_anchor(self, k: int) -> RangeProblem:
         """Return the problem of the ranges to anchor k alone, with a fixed frame."""
@@ -315,7 +314,7 @@ class _System:
 
     @property
     def share(self) -> Array:
-        return np.concatenate([np.ones(len(p.range_m)) if p.share is None else p.share for p in self.parts])
+        return np.concatenate([part.share for part in self.parts])
 
     def rho_with_derivatives(self, z: Array) -> Array:
         # Priors have no robust loss: only ranges have outliers.

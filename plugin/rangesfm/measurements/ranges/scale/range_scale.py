@@ -19,7 +19,7 @@ from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.mistakes.anchor_sides import AnchorSides, likelier_sides
 from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges, drifts
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, linearized, ranges_on_map
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
 from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
@@ -130,8 +130,7 @@ class RangeScale(KindOnMap):
         alone, problem, known = self._without_others.solution, self.solution.problem, self.alone.scale
         formal = alone.fit.log_scale_stddev * alone.errors.inflation
         share = float(np.clip((formal * known.value / known.stddev) ** 2, ROUNDING, 1.0))
-        shares = share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
-        return replace(self, solution=_solved(self.solution, replace(problem, share=shares)))
+        return replace(self, solution=_solved(self.solution, replace(problem, share=share * problem.share)))
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""
@@ -242,14 +241,6 @@ class RangeScale(KindOnMap):
         placed = bent.state.metric_from_model @ self.posed.first_camera_from_sfm
         doubts = tuple(doubts_of_ranges(self.posed, solution, known.uncertainty, {}))
         yield BentMap(replace(self, told=told), placed, known, doubts, remarks)
-
-    def cause(self, on_map: JointMap) -> str:
-        """Return the likeliest mistake that the ranges show."""
-        try:
-            causes = diagnose_ranges(self.on(on_map), seed=self.posed.given.seed).causes
-        except np.linalg.LinAlgError:
-            return ""
-        return causes_in_words(causes) if causes else ""
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> Diagnosis:
         """Return the tests of all mistakes that ranges can show."""

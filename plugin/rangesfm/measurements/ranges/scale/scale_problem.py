@@ -205,6 +205,7 @@ def scale_problem(
         bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
         common_bias_stddev_m=common_stddev_m,
         frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
+        share=errors.share,
         distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
         gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,

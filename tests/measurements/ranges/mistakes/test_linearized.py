@@ -63,6 +63,7 @@ def small_map(
         bias_stddev_m=np.full(NUM_ANCHORS, 0.1),
         common_bias_stddev_m=0.1,
         frame_is_free=frame_is_free,
+        share=np.ones(num),
     )
     state = RangeState(PLACED, ANCHORS_M.copy(), problem.bias_mean_m)
     posed: Any = SimpleNamespace(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.diagnostics.test_linearized import ANCHORS_M, small_map
+from tests.measurements.ranges.mistakes.test_linearized import ANCHORS_M, small_map
 
 from rangesfm.measurements.ranges.mistakes import catalogue
 from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis

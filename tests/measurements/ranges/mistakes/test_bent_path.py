@@ -10,6 +10,7 @@ from tests.known import known
 from rangesfm.arrays import Array
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
@@ -44,7 +45,7 @@ def mown(seed: int) -> RangesOnMap:
     log = RangeLog.from_arrays(np.full(len(at_s), "A"), np.maximum(range_m, 0.1), timestamp_s=at_s)
     anchors = [Anchor("A", None)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="unknown")
-    ranges = known(found.find(RangeScale))
+    ranges = known(find_kind(found.kinds, RangeScale))
     return ranges_on_map(ranges.posed, ranges.solution, WalkBending(in_first_camera(path)))
 
 
@@ -86,7 +87,7 @@ def drifting(share: float, seed: int) -> tuple[ScaleEstimate, Array, Array]:
 def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:
     rigid, path, places = drifting(0.3, seed=0)
     placed = rigid.where_bent(ScaleOptions())
-    bent_by_m = known(rigid.find(RangeScale)).bends_m(known(rigid.on_map))
+    bent_by_m = known(find_kind(rigid.kinds, RangeScale)).bends_m(known(rigid.on_map))
     best = align_points(path, places)
     off_m = rmse(best.apply(path) - places)
     assert off_m > 0.5
@@ -104,5 +105,5 @@ def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much
 
 def test_a_path_that_does_not_drift_stays_as_it_was() -> None:
     rigid, _, _ = drifting(0.0, seed=1)
-    assert [*known(rigid.find(RangeScale)).bent(known(rigid.on_map))] == []
+    assert [*known(find_kind(rigid.kinds, RangeScale)).bent(known(rigid.on_map))] == []
     assert rigid.where_bent(ScaleOptions()).metric_from_sfm is rigid.metric_from_sfm
