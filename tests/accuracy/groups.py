@@ -108,7 +108,8 @@ def one_log(data: Path, name: str, with_single_anchors: bool) -> Cases:
         if with_single_anchors or not case.name.startswith("only"):
             observations = real_logs.placed(log, case, path, described, by_photo=False)
             row = real_logs.one_survey(name, case, observations, path)
-            found[f"{name}, {case.name}"] = REFUSED if row is None else of_interval(*row)
+            of_path = {} if row is None or row[4] is None else {"rmse": row[4]}
+            found[f"{name}, {case.name}"] = REFUSED if row is None else {**of_interval(*row[:4]), **of_path}
     return found
 
 
@@ -403,7 +404,7 @@ GROUPS: Sequence[Group] = (
     Group(
         "real logs",
         "Real logs with truth, each with its anchors surveyed, known, unknown, and one alone",
-        scale_figures(),
+        (*scale_figures(), RMSE),
         log_tasks,
     ),
     Group(

@@ -46,6 +46,7 @@ from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.util.geometry.reference import Reference, read_reference
+from rangesfm.util.geometry.similarity import rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
@@ -86,13 +87,14 @@ def main() -> None:
                     found.append(one_survey(name, case, observations, given))
     known = np.array([row for row in found if row is not None], dtype=np.float64)
     if len(known):
-        errors, low, high, num_named = known.T
+        errors, low, high, num_named, away_m = known.T
         half_widths = (high - low) / 2
         from_middle = 1.96 * (errors + (low + high) / 2) / half_widths
         print(
             f"{len(known)} of {len(found)}: {100 * np.mean((low <= -errors) & (-errors <= high)):.0f} % covered, the "
             f"truth from the middle in stddevs {np.sqrt(np.mean(from_middle**2)):.2f} (rms), median half width "
-            f"{100 * np.median(half_widths):.2f} %, a mistake named in {np.count_nonzero(num_named)}"
+            f"{100 * np.median(half_widths):.2f} %, a mistake named in {np.count_nonzero(num_named)}; paths in a "
+            f"site off by {np.nanmedian(away_m):.2g} m (median)"
         )
 
 
@@ -180,9 +182,10 @@ def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
 
 def one_survey(
     name: str, case: Case, observations: RangeObservations, path: Trajectory
-) -> tuple[float, float, float, int] | None:
+) -> tuple[float, float, float, int, float | None] | None:
     """Return the error of the scale's logarithm, its interval about the estimate, and the number of mistakes named.
 
+    The last number is the root mean square error of the path in the site, metres; None where it is not placed there.
     None if refused.
     """
     began = time.process_time()
@@ -203,7 +206,8 @@ def one_survey(
         f"{seconds:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}; {causes}",
         flush=True,
     )
-    return error, low, high, len(causes)
+    away_m = found.metric_from_sfm.apply(path.centers) - FACTOR * path.centers
+    return error, low, high, len(causes), rmse(away_m) if found.frame == "site" else None
 
 
 def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
