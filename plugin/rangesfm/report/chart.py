@@ -214,7 +214,7 @@ def _labels(panel: Panel) -> list[Spec]:
 
 
 def joined_labels(panel: Panel) -> list[Mark]:
-    """Return marks for labelling: of marks less than 12 pixels apart only the first, with all their labels."""
+    """Return marks for labelling: of marks less than 12 pixels apart only the rightmost, with all their labels."""
     scale = [(high - low) / size for (low, high), size in zip(panel.limits, panel.size)]
     groups: list[list[Mark]] = []
     for mark in panel.marks:
@@ -224,7 +224,12 @@ def joined_labels(panel: Panel) -> list[Mark]:
                 break
         else:
             groups.append([mark])
-    return [group[0]._replace(label=", ".join(mark.label for mark in group)) for group in groups]
+    # The label stands to the right of its mark, where no other mark of its group is.
+    rightmost = [max(group, key=lambda mark: mark.x / scale[0]) for group in groups]
+    return [
+        mark._replace(label=", ".join(one.label for one in group))
+        for mark, group in zip(rightmost, groups, strict=True)
+    ]
 
 
 def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
