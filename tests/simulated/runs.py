@@ -99,7 +99,6 @@ def run(survey: MadeSurvey, seed: int) -> Run:
         return Run(survey, None, None, refusal=str(error))
     ranges, on_map = find_kind(estimate.kinds, RangeScale), estimate.on_map
     assert ranges is not None
-    assert on_map is not None
     return Run(survey, estimate.where_bent(options), ranges.tests(on_map, {}), ranges.on(on_map))
 
 

@@ -148,12 +148,8 @@ def told(survey: MadeSurvey, kind: str, seed: int) -> Line:
         "places_covered": None if known is None else _covered(off_m, known),
         "verdict": estimate.verdict,
         "reasons": list(estimate.reasons),
-        "causes": []
-        if metric.diagnosis is None
-        else [f"{c.name} {c.subject}".strip() for c in metric.diagnosis.causes],
-        "of_evidence": []
-        if metric.diagnosis is None
-        else [t.name for t in metric.diagnosis.tests if t.rejected and not t.stddev],
+        "causes": [f"{c.name} {c.subject}".strip() for c in metric.diagnosis.causes],
+        "of_evidence": [t.name for t in metric.diagnosis.tests if t.rejected and not t.stddev],
     }
 
 

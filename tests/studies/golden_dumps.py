@@ -230,7 +230,7 @@ def tables_of(metric: MetricResult) -> Values:
 def range_equations_of(metric: MetricResult) -> Values:
     """Return residuals of ranges, their derivatives by the map as a whole and the anchors, and the same of priors."""
     on_map = metric.all_measured
-    if on_map is None or (ranges := find_kind(on_map.kinds, RangeScale)) is None:
+    if (ranges := find_kind(on_map.kinds, RangeScale)) is None:
         return {}
     moved = ranges.moved(on_map.posterior) if on_map.is_at_rest else ranges
     problem = linearized(moved.on(on_map)).with_learnt_errors()
@@ -245,10 +245,9 @@ def range_equations_of(metric: MetricResult) -> Values:
 
 def position_equations_of(metric: MetricResult) -> Values:
     """Return residuals of positions and control points, their derivatives by the map as a whole, and their errors."""
-    found, on_map = find_kind(metric.kinds, PositionScale), metric.all_measured
-    if found is None or on_map is None:
+    found, problem = find_kind(metric.kinds, PositionScale), metric.all_measured.problem
+    if found is None:
         return {}
-    problem = on_map.problem
     return {
         "positions residual": problem.linear.residual_m[problem.rows[POSITIONS]],
         "positions derivatives": problem.linear.design[problem.rows[POSITIONS]],
@@ -273,10 +272,9 @@ def length_equations_of(metric: MetricResult) -> Values:
 def noise_of(metric: MetricResult) -> Values:
     """Return the standard deviation of each component of the noise, as learnt for the final map."""
     on_map = metric.all_measured
-    has_positions = on_map is not None and POSITIONS in on_map.observed
     learnt = {
         "ranges": metric.estimate.errors.learned,
-        "positions": on_map.problem.noise_of(POSITIONS) if on_map is not None and has_positions else None,
+        "positions": on_map.problem.noise_of(POSITIONS) if POSITIONS in on_map.observed else None,
     }
     return {
         f"{kind} noise {name}": np.array(stddev)
@@ -293,7 +291,7 @@ def covariances_of(metric: MetricResult) -> Values:
     found["scale half width"] = np.array(uncertainty.half_width_95)
     if metric.estimate.placement is not None:
         found["covariance placement"] = metric.estimate.placement
-    if find_kind(metric.kinds, PositionScale) is not None and metric.all_measured is not None:
+    if find_kind(metric.kinds, PositionScale) is not None:
         found["covariance by positions"] = metric.all_measured.posterior.place
     joint = None if metric.kept_refinement is None else metric.kept_refinement.covariance
     if joint is not None:

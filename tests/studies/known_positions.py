@@ -250,7 +250,7 @@ def told(known: Known, mistake: str, pixel_stddev: float, seed: int) -> Line:
     in_stddevs = shift_m / (metric.place.stddev_m if metric.place is not None else np.nan)
     has_bound = "ranges" not in known.names and mistake == "none"
     bounds = known.bound(pixel_stddev) if has_bound else (np.nan, np.nan)
-    tests = () if metric.diagnosis is None else metric.diagnosis.tests
+    tests = metric.diagnosis.tests
     return {
         "refused": "",
         "scale": (off, (off - (low + high) / 2) / metric.estimate.uncertainty.empirical, off / bounds[0]),

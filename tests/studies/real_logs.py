@@ -214,7 +214,6 @@ def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, 
     """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
     ranges, on_map = find_kind(found.kinds, RangeScale), found.on_map
     assert ranges is not None
-    assert on_map is not None
     return found.where_bent(options), [cause.words for cause in ranges.tests(on_map, {}).causes]
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError, number_text
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.pipeline.make_metric_map import metric_map
 from rangesfm.pipeline.metric_result import MetricResult
@@ -21,7 +20,7 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
     The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
     apart the likelier one is corrected, too; the user has asked for it and is told.
     """
-    if metric.diagnosis is None or not metric.diagnosis.causes:
+    if not metric.diagnosis.causes:
         return run, metric
     if metric.models:
         run.journal.warn("no mistake is corrected: the map is joined from several models")
@@ -36,7 +35,7 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
     inputs = replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
     corrected = replace(run, inputs=inputs)
     try:
-        moved = replace(path, observations=_observations(corrected, path, metric, metric.diagnosis))
+        moved = replace(path, observations=_observations(corrected, path, metric))
         is_refined = metric.refined is not None
         adopted = metric_map(corrected, moved, refine=is_refined)
     except GeometryError as error:
@@ -48,9 +47,9 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
     return corrected, adopted.doubted((said,))
 
 
-def _observations(run: SurveyRun, path: PathOfModel, metric: MetricResult, diagnosis: Diagnosis) -> RangeObservations:
+def _observations(run: SurveyRun, path: PathOfModel, metric: MetricResult) -> RangeObservations:
     """Return the corrected ranges on the path. Ranges that the correction leaves out get the status of check ranges."""
-    correction, rows = diagnosis.causes[0].correction, diagnosis.rows
+    correction, rows = metric.diagnosis.causes[0].correction, metric.diagnosis.rows
     log, offset, known_s = run.inputs.log, metric.time_offset, metric.time_offset_s or 0.0
     shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(log))
     offset_s = shift_s + (known_s if offset is None or log.timestamp_s is None else offset.at(log.timestamp_s))

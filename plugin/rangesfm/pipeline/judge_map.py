@@ -41,8 +41,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     """
     survey, journal = run.survey, run.journal
     metric, on_map = _estimated(survey, metric), metric.all_measured
-    path, kinds = metric.trajectory.as_in(metric.final), () if on_map is None else on_map.kinds
-    bends_m = [] if on_map is None else [each.bends_m(on_map) for each in kinds]
+    path, bends_m = metric.trajectory.as_in(metric.final), [each.bends_m(on_map) for each in on_map.kinds]
     bent_by_m = next((each for each in bends_m if len(each)), np.zeros(0))
     diagnosis = _tested(run, metric, path.centers, bent_by_m)
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
@@ -91,8 +90,6 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
         centers_m: (n, 3) keyframe centres in the final map. bent_by_m: (n,) as for ``place_of_map``.
     """
     estimate, on_map, diagnosis = metric.estimate, metric.all_measured, Diagnosis()
-    if on_map is None:
-        return diagnosis
     for is_placing in (True, False):
         kinds = [each for each in on_map.kinds if each.places_map is is_placing]
         for each in kinds:
@@ -142,7 +139,7 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
     """
     start, at = metric.estimate, metric.all_measured
     try:
-        if at is not None and at.is_at_rest:
+        if at.is_at_rest:
             estimate, metric = start.at_rest(at, survey.scale), _moved(metric, at)
         else:
             if start.method != "two-candidate":  # which has no interval
@@ -157,10 +154,8 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
     return replace(metric, estimate=estimate)
 
 
-def with_cause(error: GeometryError, on_map: JointMap | None) -> GeometryError:
+def with_cause(error: GeometryError, on_map: JointMap) -> GeometryError:
     """Return a refusal with the likeliest mistakes that the measurements on its map show."""
-    if on_map is None:
-        return error
     causes = []
     for each in on_map.kinds:
         with contextlib.suppress(np.linalg.LinAlgError):  # they determine too little for tests

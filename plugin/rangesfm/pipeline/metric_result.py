@@ -65,7 +65,7 @@ class MetricResult:
         place: how well the place of the map in the site frame is known; None where the frame is that of the first
             camera, or where it has not been judged yet.
         models: all models that were to be joined to this one; empty where there was only one.
-        diagnosis: result of the tests of mistakes on the final map.
+        diagnosis: result of the tests of mistakes on the final map; empty before.
         tape: the measured lengths, with those left out that cannot be in the map; empty without any.
         positions: the known positions, with those left out that contradict the others.
         rivals: other likely time offsets.
@@ -86,7 +86,7 @@ class MetricResult:
     why_broken: tuple[str, ...] = ()
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
-    diagnosis: Diagnosis | None = None
+    diagnosis: Diagnosis = field(default_factory=Diagnosis)
     tape: Tape = field(default_factory=Tape)
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
     rivals: Rivals = NO_RIVALS
@@ -104,17 +104,17 @@ class MetricResult:
         return None if self.why_broken else self.refinement
 
     @property
-    def all_measured(self) -> JointMap | None:
+    def all_measured(self) -> JointMap:
         """Return the map from which the final one was moved to its estimate, with all that is measured in it.
 
-        None where nothing is known of the scale's error.
+        It has no kinds where nothing is known of the scale's error.
         """
         return (self.at_refined if self.kept_refinement is not None else None) or self.estimate.on_map
 
     @property
     def kinds(self) -> tuple[KindOnMap, ...]:
         """Return the measurements on that map."""
-        return () if self.all_measured is None else self.all_measured.kinds
+        return self.all_measured.kinds
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
@@ -163,7 +163,7 @@ class MetricResult:
     def upward(self) -> Array | None:
         """Return the upward unit vector (3,) in the final map as it was measured; None if it was not."""
         on_map = self.all_measured
-        if on_map is None or (gravity := upward_by(on_map.kinds, None)) is None:
+        if (gravity := upward_by(on_map.kinds, None)) is None:
             return None
         return np.asarray(on_map.estimate.rotation @ on_map.path.world_from_cam[0] @ gravity.up_in_first_camera)
 

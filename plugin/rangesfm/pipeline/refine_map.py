@@ -146,7 +146,7 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined:
     """
     metric, estimate = refined.metric, start.estimate
     refinement, at = metric.kept_refinement, metric.all_measured
-    if refinement is None or at is None:
+    if refinement is None:
         return refined
     for sides in (sides for each in at.kinds for sides in each.sides(at)):
         estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
@@ -178,7 +178,7 @@ def metres_per_unit_of(unscaled: Trajectory, path: Trajectory, firm_ids: Indices
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
     """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
     start, model = metric.estimate.on_map, rest.problem.metric
-    if start is None:
+    if not start.kinds:
         return None
     path = metric.trajectory.as_in(model)
     scale = metres_per_unit_of(metric.trajectory, path, rest.firm_ids)

@@ -50,7 +50,7 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         found: what the stages found.
         others: entries that do not follow from it, from ``georeference`` on, and ``distances`` and ``comparison``.
     """
-    estimate, diagnosis = found.estimate, found.diagnosis
+    estimate = found.estimate
     return ResultSummary(
         scale=entries.ScaleEntry.model_validate(estimate),
         place=None if found.place is None else entries.PlaceEntry.model_validate(found.place),
@@ -64,7 +64,7 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         refine=_refinement(found),
         loops=_loops(found),
         points=points_entry(found),
-        tests=tuple(map(entries.MistakeEntry.model_validate, diagnosis.tests if diagnosis else ())),
+        tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests)),
         reliability=_reliability(found),
         models=tuple(_model(model, estimate.metric_from_sfm) for model in found.models),
         **_entries_of_kinds(found),
@@ -75,7 +75,7 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
 def _entries_of_kinds(found: MetricResult) -> dict[str, Any]:
     """Return the own entries of the kinds of measurement, by name."""
     on_map = found.all_measured
-    of_kinds = {} if on_map is None else {kind.kind: kind.entry(on_map) for kind in on_map.kinds}
+    of_kinds = {kind.kind: kind.entry(on_map) for kind in on_map.kinds}
     return {name: entry for name, entry in of_kinds.items() if entry}
 
 
@@ -181,7 +181,7 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
 def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
     """Return the entry; None where no mistakes were tested."""
     diagnosis = found.diagnosis
-    if diagnosis is None or not diagnosis.hidden:
+    if not diagnosis.hidden:
         return None
     bound, limited_by = scale_bound(found.estimate.uncertainty, diagnosis.hidden)
     is_found = any(test.rejected for test in diagnosis.tests)

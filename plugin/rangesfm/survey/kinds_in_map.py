@@ -174,7 +174,7 @@ def measured_in_map(inputs: RangingInputs, survey: Survey, estimate: ScaleEstima
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
+    of_kinds = (source for kind in on_map.kinds for source in kind.sources(on_map))
     upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
     levelled = () if upward is None else (Upwards(upward),)
     ranges = ranges_in_map(inputs, estimate, path, survey.refine)

@@ -179,6 +179,6 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
         advice=("use the robust method",),
         ranges=replace(robust.ranges, median_off_m=np.nan, sensitivity=NOT_KNOWN, per_anchor={}),
         by_kind={},
-        on_map=None,
+        on_map=replace(robust.on_map, kinds=()),
         placement=None,
     )

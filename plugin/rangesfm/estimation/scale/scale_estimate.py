@@ -36,7 +36,7 @@ class ScaleEstimate:
         reasons: why, in words.
         advice: what to do about it, in words; for a finished survey also what would improve the next one most.
         ranges: what is said of the ranges of the log, which may be none.
-        on_map: what the estimate was computed from; None with two-candidate.
+        on_map: what the estimate was computed from; without any kinds with two-candidate, which uses none of them.
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
         remarks: those of the reasons that a refinement does not change.
@@ -52,7 +52,7 @@ class ScaleEstimate:
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
     ranges: RangeEstimate
-    on_map: JointMap | None = None
+    on_map: JointMap
     placement: Array | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ class ScaleEstimate:
     @property
     def kinds(self) -> tuple[KindOnMap, ...]:
         """The measurements from which it was computed."""
-        return () if self.on_map is None else self.on_map.kinds
+        return self.on_map.kinds
 
     def where_bent(self, options: ScaleOptions) -> ScaleEstimate:
         """Return the estimate of a map that is not refined where measurements bend it, anchors on their likelier sides.
@@ -104,8 +104,6 @@ class ScaleEstimate:
             GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
         """
         found, on_map = self, self.on_map
-        if on_map is None:
-            return self
         for each in on_map.kinds:
             for bent in each.bent(on_map):
                 known = bent.posterior

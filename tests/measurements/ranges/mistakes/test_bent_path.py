@@ -87,7 +87,7 @@ def drifting(share: float, seed: int) -> tuple[ScaleEstimate, Array, Array]:
 def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:
     rigid, path, places = drifting(0.3, seed=0)
     placed = rigid.where_bent(ScaleOptions())
-    bent_by_m = known(find_kind(rigid.kinds, RangeScale)).bends_m(known(rigid.on_map))
+    bent_by_m = known(find_kind(rigid.kinds, RangeScale)).bends_m(rigid.on_map)
     best = align_points(path, places)
     off_m = rmse(best.apply(path) - places)
     assert off_m > 0.5
@@ -105,5 +105,5 @@ def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much
 
 def test_a_path_that_does_not_drift_stays_as_it_was() -> None:
     rigid, _, _ = drifting(0.0, seed=1)
-    assert [*known(find_kind(rigid.kinds, RangeScale)).bent(known(rigid.on_map))] == []
+    assert [*known(find_kind(rigid.kinds, RangeScale)).bent(rigid.on_map)] == []
     assert rigid.where_bent(ScaleOptions()).metric_from_sfm is rigid.metric_from_sfm
