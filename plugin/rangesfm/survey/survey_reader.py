@@ -45,7 +45,8 @@ def parse_toml(path: Path) -> tuple[dict[str, Any], OptionsOrigin]:
         where = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)$", str(error))
         message = str(error)[: where.start()] if where else str(error)
         line = None if where is None else int(where[1] or text.rstrip().count("\n") + 1)
-        raise InputError(f"not a TOML file ({printable(message)})", path, line) from None
+        hint = "texts stand in straight double quotes, with / between folders, and numbers have decimal points"
+        raise InputError(f"not a TOML file ({printable(message)}); {hint}", path, line) from None
 
 
 def parse_inline_table(text: str) -> dict[str, Any]:

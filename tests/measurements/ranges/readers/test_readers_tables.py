@@ -107,6 +107,7 @@ LONG = {
     "month first, in halves of a day": lines(
         "time,anchor,range", lambda t, a, r: f"1/31/2026 {clock(t)[1:]} PM,{a},{r:.3f}"
     ),
+    "time of day, in halves of a day": lines("time,anchor,range", lambda t, a, r: f"{clock(t)[1:]} PM,{a},{r:.3f}"),
     "day first with points": lines("Datum;Uhrzeit;Anker;Distanz", lambda t, a, r: f"1.2.2026;{clock(t)};{a};{r:.3f}"),
     "row of units": lines("time,anchor,range\n[ms],[],[cm]", lambda t, a, r: f"{t * 1000:.0f},{a},{r * 100:.1f}"),
     "ros2 topic echo --csv": lines(

@@ -292,7 +292,8 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         return
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
     remedy = (
-        "let the offset be searched for (ranges_time_offset auto), or film sharp turns at the beginning and the end"
+        "film sharp turns at the beginning and the end, or let the offset be searched for, if you gave it "
+        "(ranges_time_offset auto)"
     )
     yield Hypothesis(
         "clock offset",

@@ -21,7 +21,10 @@ CIVIL_TIME = re.compile(
     r"(\d\d?):(\d\d(?::\d\d(?:[.,]\d{1,18})?)?)(?: ?([AP])M)? ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
     re.ASCII | re.IGNORECASE,
 )
-TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])", re.ASCII)
+TIME_OF_DAY = re.compile(
+    r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])(?: ?([AP])M\b)?",
+    re.ASCII | re.IGNORECASE,
+)
 _COMPACT = re.compile(  # 20260131T120000.5Z, 20260131120000500
     r"((?:19|20)\d\d)(0[1-9]|1[0-2])([0-2]\d|3[01])[T_ -]?"
     r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)(?:[.,]?(\d{1,9}))?(Z?)",
@@ -70,13 +73,19 @@ def _seconds_from_civil(text: str, order: str) -> float:
         raise ValueError(text)
     date, hour, rest, half, zone = match.groups()
     year, month, day = (field for _, field in sorted(zip(map("ymd".index, order), re.split("[-/.]", date))))
-    hour = int(hour) if half is None else int(hour) % 12 + 12 * (half in "pP")
-    seconds = float(np.datetime64(f"{year}-{month:>02}-{day:>02}T{hour:02}:{rest.replace(',', '.')}", "us").astype(int))
+    seconds = float(
+        np.datetime64(f"{year}-{month:>02}-{day:>02}T{_hour(hour, half):02}:{rest.replace(',', '.')}", "us").astype(int)
+    )
     seconds *= 1e-6
     if zone is None or zone.upper() in ("Z", "UTC"):
         return seconds
     hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
     return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
+
+
+def _hour(hour: str, half: str | None) -> int:
+    """Return an hour of the day, of a half of it if that is "A" or "P"."""
+    return int(hour) if half is None else int(hour) % 12 + 12 * (half in "pP")
 
 
 def time_in_front(text: str) -> str | None:
@@ -110,7 +119,7 @@ class CivilClock:
         of_day = TIME_OF_DAY.fullmatch(text)
         if of_day is None:
             return _seconds_from_civil(text, self._order)
-        seconds = int(of_day[1]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
+        seconds = _hour(of_day[1], of_day[4]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
         if seconds < self._last_of_day_s - _DAY_S / 2:
             self._days += 1
         self._last_of_day_s = seconds
