@@ -35,9 +35,9 @@ TESTS = (
     "tests/estimation/scale/test_consensus.py",
     "tests/estimation/scale/test_initialize.py::TestRefused",
     "tests/estimation/scale/test_initialize.py::TestWithoutNoise",
-    "tests/estimation/scale/test_range_equation.py",
+    "tests/measurements/ranges/scale/test_range_equation.py",
     "tests/estimation/scale/test_starts.py",
-    "tests/estimation/scale/test_two_candidate.py",
+    "tests/measurements/ranges/scale/test_two_candidate.py",
 )
 
 

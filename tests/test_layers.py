@@ -54,7 +54,7 @@ MODULES = {
 
 OF_SENSOR = ("inertial_motions", "inertial_fit", "inertial_scale", "motion", "preintegration", "sensor_prior")
 OF_FIT = ("cost", "points_cost", "gravity", "radio", "site_positions")
-ON_MAP = ("range_scale", "length_scale", "position_scale")
+ON_MAP = ("range_scale", "range_start", "length_scale", "position_scale")
 # Modules that say how a kind is measured. Others in the folder of a kind hold what was read.
 KINDS = {
     name

@@ -62,12 +62,8 @@ class Located(ABC):
 class KindOnMap(Located):
     """Measurements of one kind, located in a map that moves as a whole."""
 
-    clock: ClassVar[str] = ""
-    """Component of their errors that is due to their clock; a fit that estimates its offset takes it out."""
     shows_bending: ClassVar[bool] = False
     """Whether there are so many of them that they show by how much a map is bent."""
-    is_solved: ClassVar[bool] = False
-    """Whether they were solved with unknowns of their own, so that a map with them is linear about their solution."""
 
     notes: tuple[str, ...] = ()
     """What is said of them whatever becomes of the map, in words."""
@@ -142,27 +138,15 @@ class KindOnMap(Located):
         del others
         return self
 
-    def with_their_share(self) -> Self:
-        """Return them as they count beside other kinds."""
-        return self
-
     def concluded(self, on_map: JointMap) -> Self:
         """Return them with what the whole map says of them."""
         del on_map
         return self
 
-    def of_log(self, before: RangeEstimate) -> RangeEstimate:
-        """Return what is said of the ranges of the log; what was known before if they are of another kind."""
-        return before
-
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> Self:
         """Return them on the map that was bent by steps, and then moved as a whole to the estimate of a posterior."""
         del known, bent
         return self
-
-    def posterior(self, problem: JointProblem) -> Posterior:
-        """Return what they say of the map alone, given the problem of them alone about the placement."""
-        return problem.posterior()
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield faults that make an interval doubtful which rests on them first of all."""
@@ -183,6 +167,47 @@ class KindOnMap(Located):
         against = self.against_others(on_map, by_kind)
         reasons = tuple(f"{row.words}: {row.remedy}" for row in against if row.rejected)
         return MistakeTests(against, reasons, of_place=reasons if self.places_map else ())
+
+    def against_others(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> tuple[MistakeTest, ...]:
+        """Return the tests that compare the scale with that by each of the kinds before in the table."""
+        before = itertools.takewhile(lambda each: each.kind != self.kind, on_map.kinds)
+        used = (each for each in before if {each.kind, self.kind} <= by_kind.keys())
+        return tuple(against_other(self, each, by_kind[self.kind], by_kind[each.kind]) for each in used)
+
+    def entry(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return their own entry of ``result.json``, whose key is their name; empty without one."""
+        del on_map
+        return {}
+
+    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
+        """Return the measurements for the fit of a map that may bend, given all that is measured in it as one piece."""
+        del on_map
+        return ()
+
+    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""
+        del on_map
+        return {}
+
+    # What only kinds have that are solved with unknowns of their own, as ranges with their anchors.
+
+    is_solved: ClassVar[bool] = False
+    """Whether they were solved with unknowns of their own, so that a map with them is linear about their solution."""
+
+    clock: ClassVar[str] = ""
+    """Component of their errors that is due to their clock; a fit that estimates its offset takes it out."""
+
+    def with_their_share(self) -> Self:
+        """Return them as they count beside other kinds."""
+        return self
+
+    def posterior(self, problem: JointProblem) -> Posterior:
+        """Return what they say of the map alone, given the problem of them alone about the placement."""
+        return problem.posterior()
+
+    def of_log(self, before: RangeEstimate) -> RangeEstimate:
+        """Return what is said of the ranges of the log; what was known before if they are of another kind."""
+        return before
 
     def bends_m(self, on_map: JointMap) -> Array:
         """Return (n,) how far they bend each keyframe of a map that is only scaled; (0,) if they do not."""
@@ -206,27 +231,6 @@ class KindOnMap(Located):
         """
         del known, bent
         yield from ()
-
-    def against_others(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> tuple[MistakeTest, ...]:
-        """Return the tests that compare the scale with that by each of the kinds before in the table."""
-        before = itertools.takewhile(lambda each: each.kind != self.kind, on_map.kinds)
-        used = (each for each in before if {each.kind, self.kind} <= by_kind.keys())
-        return tuple(against_other(self, each, by_kind[self.kind], by_kind[each.kind]) for each in used)
-
-    def entry(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return their own entry of ``result.json``, whose key is their name; empty without one."""
-        del on_map
-        return {}
-
-    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
-        """Return the measurements for the fit of a map that may bend, given all that is measured in it as one piece."""
-        del on_map
-        return ()
-
-    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""
-        del on_map
-        return {}
 
 
 _Kind = TypeVar("_Kind", bound=KindOnMap)

@@ -28,7 +28,8 @@ from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
-from rangesfm.measurements.ranges.scale.range_scale import RangesAtRest, RangeScale, RangesToSolve
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
 from rangesfm.measurements.source import Measured
 from rangesfm.options import RefineOptions
@@ -109,8 +110,9 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
     if not inputs.tape.distances:
         return None
     found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path)
-    like = find_kind(at.before, LengthScale)
-    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, like, inputs.tape.distances)
+    if (before := find_kind(at.before, LengthScale)) is not None:
+        return before.on_refined_map(found, at.path, at.bending, at.metres_per_unit)
+    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, inputs.tape.distances)
 
 
 def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:

@@ -1,1 +1,1 @@
-"""The scale stage: metres per SfM unit from ranges and an unscaled path."""
+"""The scale stage: metres per SfM unit from all that is measured in an unscaled map."""

@@ -106,6 +106,20 @@ class LengthScale(KindOnMap):
         """(m,) relative change of the scale by the lengths if the length was a metre longer."""
         return self.alone.problem.of_kind(LENGTHS, self.alone.posterior.gains)
 
+    def on_refined_map(
+        self, distances: LocatedDistances, path: Trajectory, bending: MapBending, metres_per_unit: float
+    ) -> LengthScale:
+        """Return the same lengths on the map that this one became, with the same ones left out.
+
+        Args:
+            distances: all measured ones in the refined map. Others as of the lengths.
+
+        Raises:
+            GeometryError: both ends of a length are in one place of the map.
+        """
+        lengths = _subset(distances, self.rows, path)
+        return replace(self, lengths=lengths, path=path, bending=bending, metres_per_unit=metres_per_unit)
+
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that nothing checks a single length, and that the lengths are too short."""
         if len(self.rows) == 1:
@@ -208,28 +222,29 @@ def lengths_between_points(
     path: Trajectory,
     bending: MapBending,
     metres_per_unit: float = 1.0,
-    like: LengthScale | None = None,
     taped: Sequence[TapedDistance] = (),
 ) -> LengthScale | None:
     """Return the lengths among measured distances, before any test; None where there is none between points.
 
     Args:
-        like: the same lengths in another map, of which the same are kept; None: all that are no checks.
         taped: the distances as they were given, for the tests.
 
     Raises:
         GeometryError: both ends of a length are in one place of the map.
     """
-    rows = np.flatnonzero(distances.is_between_points & ~distances.is_check) if like is None else like.rows
+    rows = np.flatnonzero(distances.is_between_points & ~distances.is_check)
     if not len(rows):
         return None
+    lengths, nothing, every = _subset(distances, rows, path), np.zeros(len(rows)), np.ones(len(rows), dtype=bool)
+    given = tuple(taped[row] for row in rows.tolist()) if taped else ()
+    return LengthScale(lengths, rows, path, bending, metres_per_unit, every, nothing, nothing + np.inf, nothing, given)
+
+
+def _subset(distances: LocatedDistances, rows: Indices, path: Trajectory) -> LocatedDistances:
     extent = float(np.linalg.norm(path_shape(path.centers).stddevs))
     if not np.all(distances.model_length[rows] > 1e-9 * extent):
         raise GeometryError("a measured length has both its ends in one place of the map")
-    lengths, nothing = distances.subset(np.isin(np.arange(len(distances)), rows)), np.zeros(len(rows))
-    kept = np.ones(len(rows), dtype=bool) if like is None else like.is_kept
-    given = tuple(taped[row] for row in rows.tolist()) if taped else ()
-    return LengthScale(lengths, rows, path, bending, metres_per_unit, kept, nothing, nothing + np.inf, nothing, given)
+    return distances.subset(np.isin(np.arange(len(distances)), rows))
 
 
 def _test(problem: JointProblem, columns: Array) -> tuple[float, float, float]:

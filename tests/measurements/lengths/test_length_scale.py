@@ -15,7 +15,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
-from rangesfm.measurements.ranges.scale.range_scale import with_lengths
+from rangesfm.measurements.ranges.scale.range_start import with_lengths
 from rangesfm.solver.bending import Bending, MapBending, bending_part
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component

@@ -1,0 +1,143 @@
+"""Ranges found beside the other kinds: solved on an unscaled path, or where a refined map has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.measurements.joint_map import KindOnMap, Located, upward_by
+from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.ranges.cost import Ranges, anchors_at
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
+from rangesfm.measurements.ranges.scale.solution import (
+    OpenPlaceError,
+    Solution,
+    solution_from,
+    solve_scale,
+    weighted,
+)
+from rangesfm.solver.bending import MapBending
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
+
+
+@dataclass(frozen=True)
+class RangesToSolve(Located):
+    """Ranges on an unscaled path: where the map and its anchors are is found beside the other kinds.
+
+    Attributes:
+        given: the ranges. bending: of the map.
+    """
+
+    given: RangesOnPath
+    bending: MapBending
+
+    kind = RANGES
+
+    def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
+        """Return the ranges at the best solution of their problem.
+
+        Raises:
+            InputError: an anchor of the log is not given. GeometryError: the scale is not determined.
+        """
+        path, distances = self.given.trajectory, with_lengths(self.given.distances, others)
+        given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
+        placement = placement_by(others, first_camera_from(path))
+        problem, why_open = scale_problem(given, placement), tuple[str, ...]()
+        try:
+            solution = solve_scale(problem)
+        except OpenPlaceError as error:
+            why_open = (f"the map gets metres, but no place in the site: {error}",)
+            problem = scale_problem(given, placement, place_is_open=True)
+            solution = solution_from(problem, error.in_first_camera)
+        told = RangeEstimate.begun(given.observations, given.range_model)
+        return RangeScale(problem, solution, path, 1.0, self.bending, told, why_open)
+
+
+@dataclass(frozen=True)
+class RangesAtRest(Located):
+    """Ranges on the map that the scaled one became, as a scale problem in the unit of the latter.
+
+    Attributes:
+        before: on the scaled map.
+        path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
+        ranges: as weighted in the refined map. state: of it. bending: of it.
+    """
+
+    before: RangeScale
+    path: Trajectory
+    scale: float
+    ranges: Ranges
+    state: MapState
+    bending: MapBending
+
+    kind = RANGES
+
+    def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
+        """Return the ranges where the map has them."""
+        path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.posed
+        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
+        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
+        tags_m, centers_m = ranges.antennas_m(self.state)
+        problem = replace(
+            posed.ranges,
+            centers=placed.inverse().apply(centers_m),
+            tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            distances=with_lengths(posed.ranges.distances, others, scale),
+            # The model's frame is that of the first camera, in the unit of the unscaled model.
+            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
+        )
+        anchors = anchors_at(ranges.anchors, self.state.blocks)
+        state = RangeState(
+            placed,
+            np.array([anchor.position_m for anchor in anchors]),
+            np.array([anchor.range_bias_m for anchor in anchors]),
+        )
+        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
+        off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
+        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
+        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
+        posed = replace(posed, ranges=problem, given=replace(posed.given, trajectory=trajectory))
+        return RangeScale(posed, solution, path, unit, self.bending, self.before.told, self.before.notes)
+
+
+def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:
+    """Return what the first other kind that places the map says of the place of the first camera's frame.
+
+    The problem of the ranges is solved and tested with it.
+
+    Args:
+        first_camera_from_model: with the unit of the problem.
+    """
+    for each in others:
+        if each.places_map and each.is_used:
+            known = each.alone.posterior
+            best = moved_similarity(each.alone.placed, known.columns.map_step(known.step), each.alone.path)
+            return PlacementPrior.with_covariance(best @ first_camera_from_model.inverse(), np.zeros(3), known.place)
+    return None
+
+
+def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit: float = 1.0) -> LocatedDistances:
+    """Return distances between anchors with one length in the map for each other kind that gives its scale alone.
+
+    With them the problem of the ranges is solved and tested.
+
+    Args:
+        unit: of the model to which the distances refer, in units of that of the other kinds.
+    """
+    found = distances.subset(~distances.is_between_points)
+    one = np.ones(1)
+    for each in others:
+        if each.is_used and not each.places_map:
+            alone = each.alone.scale
+            length = LocatedDistances.control(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
+            found = length.joined(found)
+    return found
