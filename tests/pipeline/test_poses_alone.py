@@ -44,6 +44,18 @@ def test_a_path_that_drifts_by_more_than_its_ranges_scatter_has_a_page(
     assert "slow wandering of the ranges" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_run_scales_poses_alone_and_a_refinement_of_them_is_refused(
+    tmp_path: Path, rangesfm_command: Command
+) -> None:
+    survey = write_poses_alone(tmp_path)
+    flags = (*survey.flags, *RANGES, *KNOWN, "--no_report", "--output_path", "out")
+    done = rangesfm_command("refine", *flags, cwd=tmp_path, status=2)
+    assert "has no 3-D points to refine: a trajectory can only be scaled" in done.stderr
+    done = rangesfm_command("run", *flags, cwd=tmp_path)
+    assert "the model has no 3-D points: it is scaled, and not refined" in done.stdout + done.stderr
+    assert holds(json.loads((tmp_path / "out" / "result.json").read_text())["scale"]["interval_95"], survey.scale)
+
+
 @pytest.mark.parametrize("noise_m", [0.0, 0.03])
 def test_an_exactly_level_path_has_its_scale_from_positions(
     tmp_path: Path, rangesfm_command: Command, noise_m: float

@@ -68,7 +68,7 @@ def run_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = F
     """
     if survey.images.model is None:
         return _from_photos(survey, progress, restart=restart)
-    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
+    return _from_model(survey, progress, refine=survey.refine.enabled, or_scale=True)
 
 
 def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> RunResult:
@@ -110,9 +110,13 @@ def scale_model(survey: Survey, *, progress: Progress = SILENT) -> RunResult:
 
 
 @with_one_blas_thread
-def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
+def _from_model(survey: Survey, progress: Progress, *, refine: bool, or_scale: bool = False) -> RunResult:
+    """Scale or refine a given model; ``or_scale``: a model without points is scaled where it should be refined."""
     run = begin_run(survey, Journal(progress))
     sfm = read_registered(survey.given_model_path, run.journal)
+    if refine and or_scale and not sfm.num_points3D():
+        run.journal.note("the model has no 3-D points: it is scaled, and not refined")
+        refine = False
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):

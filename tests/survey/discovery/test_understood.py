@@ -190,3 +190,16 @@ def test_a_list_of_photos_with_places_is_of_positions(text: str, tmp_path: Path)
     path = tmp_path / "geotags.csv"
     path.write_text("\n".join([header, *(row.format(k=k) for k in range(3))]))
     assert understand([tmp_path], {})[0] == {"images.path": tmp_path / "images", "positions.path": path}
+
+
+def test_the_keyframes_of_a_slam_program_are_the_model_where_there_are_no_photos(tmp_path: Path) -> None:
+    for name in ("KeyFrameTrajectory.txt", "groundtruth.txt"):
+        (tmp_path / name).write_text("".join(f"{1e9 + k:.6f} {k} 1 2 0 0 0 1\n" for k in range(30)))
+    write_log(tmp_path / "uwb.csv", 0.0)
+    values, _ = understand([tmp_path], {})
+    assert values["images.model"] == tmp_path / "KeyFrameTrajectory.txt"
+    assert values["report.reference"] == tmp_path / "groundtruth.txt"
+    write_photos(tmp_path / "images", 3)
+    values, notes = understand([tmp_path], {})
+    assert "images.model" not in values
+    assert any("KeyFrameTrajectory.txt is a trajectory: rangesfm scale" in note for note in notes)

@@ -36,7 +36,7 @@ from rangesfm.survey.sources.source import is_video
 from rangesfm.util.files.bags import is_bag, is_bag_folder
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.util.files.text_tables import has_columns, header_names, read_head
-from rangesfm.util.geometry.reference import is_reference_file
+from rangesfm.util.geometry.reference import is_reference_file, is_tum_row
 
 PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
 POINTS, POSITIONS, REFERENCE, IMU = "points.path", "positions.path", "report.reference", "imu.path"
@@ -44,6 +44,8 @@ POINTS, POSITIONS, REFERENCE, IMU = "points.path", "positions.path", "report.ref
 _MEASURED = frozenset(
     "position positions positionen gps gnss rtk ppk geotag geotags exif pozyx marvelmind".split()  # noqa: SIM905
 )
+# Words in the name of a TUM trajectory that is the map itself, by a SLAM program.
+_BY_SLAM = frozenset({"slam", "orb", "vo", "keyframe", "keyframes", "key", "estimate", "estimated"})
 _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
@@ -86,7 +88,7 @@ class Found:
     Attributes:
         paths: folders of photos, videos, and other files, by dotted key of a survey file.
         calibrations: cameras of each file with a calibration.
-        models: folders of COLMAP models.
+        models: folders of COLMAP models, and trajectories of SLAM programs.
         unclear: lists that are not understood for sure, by dotted key of a survey file.
         notes: lines about what is there and cannot be used; each such file is listed with the reason.
         like_anchors: files that are about the log's anchors by their names, where none is understood, with the reason.
@@ -135,7 +137,7 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
                 paths[PHOTOS] += [path] if has_photos else []
                 paths[IMU] += [path] if is_bag(path) and is_imu_log(path) else []
                 if key := _key_of(path):
-                    paths[key].append(path)
+                    (models if key == MODEL else paths[key]).append(path)
                 elif not has_photos:
                     unused[_UNKNOWN].append(path)
         except UnclearListError as error:
@@ -242,7 +244,9 @@ def _key_of(path: Path) -> str | None:
 
 
 def _measured_or_true(path: Path) -> str:
-    """Return the key of a file of positions: measured ones by the name of the file, or true ones to compare with."""
+    """Return the key of a file of positions by its name: a map's, measured ones, or true ones to compare with."""
+    if is_tum_row(header_names(read_head(path))) and not _BY_SLAM.isdisjoint(words_of(path.stem)):
+        return MODEL
     return REFERENCE if _MEASURED.isdisjoint(words_of(path.stem)) else POSITIONS
 
 

@@ -121,6 +121,9 @@ LONG = {
         ),
     ),
     "JSON": lines(None, lambda t, a, r: json.dumps({"ts": t, "tag": "T", "meas": [{"anchor": a, "dist": r}]})),
+    "JSON of Pozyx": lines(
+        None, lambda t, a, r: json.dumps({"timestamp": t, "ranges": [{"anchor": a, "range": r, "rss": -80 - t}]})
+    ),
     "JSON array": json.dumps([{"t": t, "id": a, "range": r} for t, a, r in ROWS]),
     "named values": lines(None, lambda t, a, r: f"2026-01-31 09:{clock(t)[3:]} INFO anchor={a}, range={r:.3f} m"),
     "words in each row": lines(None, lambda t, a, r: f"{clock(t)} -> {a} dist: {r:.3f} m"),

@@ -138,7 +138,11 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
 def _possible_columns(layout: Layout, guess: Guess) -> Iterable[dict[str, str]]:
     """Yield the columns of a guess, with a few columns of numbers in the place of those that it misses."""
     taken = guess.told.values()
-    free = [column.name for column in layout.columns if column.kind == "numbers" and column.name not in taken]
+    free = [
+        column.name
+        for column in layout.columns
+        if column.kind == "numbers" and column.name not in taken and len({*column.numbers}) > 1
+    ]
     for names in islice(permutations(free, len(guess.missing)), _MOST_COMMANDS):
         yield {**guess.told, **dict(zip(guess.missing, names))}
 

@@ -53,8 +53,8 @@ RANGE_IN_SHORT = _words("d r")
 # Words in the names of columns that accompany the range and are not ranges.
 NO_RANGE = _words(
     "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
-    "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
-    "id index idx rtt los nlos"
+    "variance cov covariance rate dot vel velocity speed count quality rss rssi power snr offset x y z min max "
+    "threshold id index idx rtt los nlos"
 )
 # Words in the names of columns of where and how the tag or an anchor is, as the radio or the phone computed it.
 POSE = _words(
