@@ -254,15 +254,16 @@ turn, speed and shift corrected to the numbers of the sensor by ``by_sensor``, t
 The squared length of the nine residuals is the robust loss of the length of ``whitening errors`` times the share.
 Metres, seconds and radians throughout. Parameter blocks: rig_from_world before and after (7,) as [qx qy qz qw tx ty
 tz]; velocities of the sensor in the world, before and after (3,); gravity in the world (3,), which points down; biases
-(6,) of gyroscope and accelerometer; shares (6,) by which their axes read too much; by how much later than assumed the
-sensor measured (1,); mounting (6,), a rotation vector of the sensor in its own frame and its place in the rig.
+(6,) of gyroscope and accelerometer; shares (6,) by which their axes read too much; shares (6,) by which those of the
+accelerometer read of others (x of y, x of z, y of x, y of z, z of x, z of y); by how much later than assumed the sensor
+measured (1,); mounting (6,), a rotation vector of the sensor in its own frame and its place in the rig.
 
 Args:
     interval_s: time between the keyframes, positive.
     turn: (3, 3) rotation from the sensor's frame at the end into that at the start.
     speed: (3,) change of the velocity without gravity. shift: (3,) the same of the place, beyond that of the velocity.
-    at: (13,) biases, shares and clock at which they were summed up.
-    by_sensor: (9, 13) derivatives of turn (as a rotation vector at its end), speed and shift by these.
+    at: (19,) biases, shares and clock at which they were summed up.
+    by_sensor: (9, 19) derivatives of turn (as a rotation vector at its end), speed and shift by these.
     whitening: (9, 9) matrix such that ``whitening^T whitening`` is the inverse of the errors' covariance.
     rig_from_imu: (3, 3) rotation.
     share: factor of the loss, positive.

@@ -52,7 +52,7 @@ struct Measured {
     const auto center = [&arm](const Eigen::Quaterniond& rig_from_world, const Eigen::Vector3d& imu) {
       return Eigen::Vector3d(imu - rig_from_world.conjugate() * arm);
     };
-    const Eigen::Matrix<double, 13, 1> at = motion.at;
+    const Eigen::Matrix<double, 19, 1> at = motion.at;
     blocks = {PoseBlock(before, center(before, place)),
               PoseBlock(after, center(after, place + moved)),
               ToBlock(velocity),
@@ -60,7 +60,8 @@ struct Measured {
               ToBlock(gravity),
               joined(at.segment<3>(0), at.segment<3>(3)),
               joined(at.segment<3>(6), at.segment<3>(9)),
-              {at[12]},
+              joined(at.segment<3>(12), at.segment<3>(15)),
+              {at[18]},
               joined(turn, arm)};
   }
 };
@@ -85,7 +86,7 @@ TEST(InertialCost, AFreeFallMeasuresNothingButTheTurn) {
                            Eigen::Vector3d::Zero(),
                            Eigen::Vector3d::Zero(),
                            InertialMotion::OfSensor::Zero(),
-                           Eigen::Matrix<double, 9, 13>::Zero(),
+                           Eigen::Matrix<double, 9, 19>::Zero(),
                            Eigen::Matrix<double, 9, 9>::Identity() / 0.05};
   const Eigen::Quaterniond turned(Eigen::AngleAxisd(-0.1, Eigen::Vector3d::UnitX()));
   const std::vector<Block> blocks = {PoseBlock(Eigen::Quaterniond::Identity(), {0.0, 0.0, 100.0}),
@@ -93,6 +94,7 @@ TEST(InertialCost, AFreeFallMeasuresNothingButTheTurn) {
                                      {0.0, 0.0, 0.0},
                                      {0.0, 0.0, -20.0},
                                      {0.0, 0.0, -10.0},
+                                     Block(6, 0.0),
                                      Block(6, 0.0),
                                      Block(6, 0.0),
                                      {0.0},

@@ -17,6 +17,7 @@ from tests.simulated.path import lap_path
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_motions import (
     CLOCK,
+    CROSS_AXES,
     GRAVITY,
     MOUNTING,
     SCALE_ERRORS,
@@ -181,7 +182,13 @@ def _motions(path: Trajectory, rng: np.random.Generator) -> InertialMotions:
     intervals = intervals.subset(np.delete(np.arange(num - 1), 4))
     start = {velocity_block(photo): rng.normal(0, 1, 3) for photo in range(num)}
     start |= {bias_block(k): rng.normal(0, 0.1, 6) for k in range(3)}
-    start |= {GRAVITY: np.array([1.0, -9.0, 4.0]), SCALE_ERRORS: np.zeros(6), CLOCK: np.zeros(1), MOUNTING: np.zeros(6)}
+    start |= {
+        GRAVITY: np.array([1.0, -9.0, 4.0]),
+        SCALE_ERRORS: np.zeros(6),
+        CROSS_AXES: np.zeros(6),
+        CLOCK: np.zeros(1),
+        MOUNTING: np.zeros(6),
+    }
     stretch = np.arange(len(intervals)) * 3 // len(intervals)
     roots, mounting = rng.normal(0, 3, (len(intervals), 9, 9)), Mounting(path.world_from_cam[5], ARM_M)
     prior = SensorPrior(clock_s=0.01, turn_rad=0.02, arm_m=0.03)

@@ -67,7 +67,7 @@ def by_rover(seed: int = 0) -> Motion:
 
 
 TACTICAL = Grade(1e-5, 2e-4, 1e-3, 0.02, 1e-6, 5e-5)
-CONSTANT = Grade(2e-4, 3e-3, 0.0, 0.0, 0.0, 0.0, 0.0)
+CONSTANT = Grade(2e-4, 3e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The noise of a phone's sensor, and nothing else besides zeros that are always the same."""
 ZEROS = np.array([[0.01, -0.02, 0.015], [0.05, 0.02, -0.08]])
 

@@ -145,8 +145,8 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[pyceres.CostFunction, lis
             turn=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
             speed=rng.normal(0, 1, 3),
             shift=rng.normal(0, 1, 3),
-            at=rng.normal(0, 0.1, 13),
-            by_sensor=rng.normal(0, 1, (9, 13)),
+            at=rng.normal(0, 0.1, 19),
+            by_sensor=rng.normal(0, 1, (9, 19)),
             whitening=rng.normal(0, 1, (9, 9)),
             rig_from_imu=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
             loss_scale=5.0,
@@ -155,7 +155,7 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[pyceres.CostFunction, lis
             *(random_pose(rng, 1.0) for _ in range(2)),
             *(
                 rng.normal(0, size, num)
-                for num, size in ((3, 1), (3, 1), (3, 10), (6, 0.1), (6, 0.1), (1, 0.1), (6, 0.3))
+                for num, size in ((3, 1), (3, 1), (3, 10), (6, 0.1), (6, 0.1), (6, 0.1), (1, 0.1), (6, 0.3))
             ),
         ],
     ),

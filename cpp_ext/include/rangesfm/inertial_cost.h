@@ -17,10 +17,11 @@
 namespace rangesfm {
 
 // Motion of the sensor, summed up between two keyframes in its own frame at the first, and its derivatives by the
-// thirteen numbers of the sensor: biases of gyroscope and accelerometer, their scale errors, and the clock.
+// nineteen numbers of the sensor: biases of gyroscope and accelerometer, their scale errors, what axes of the
+// accelerometer read of others, and the clock.
 struct InertialMotion {
   static constexpr int kNumErrors = 9;
-  static constexpr int kNumOfSensor = 13;
+  static constexpr int kNumOfSensor = 19;
   using Errors = Eigen::Matrix<double, kNumErrors, 1>;
   using OfSensor = Eigen::Matrix<double, kNumOfSensor, 1>;
 
@@ -80,7 +81,7 @@ class InertialCost final : public ceres::CostFunction {
     const Eigen::Map<const Eigen::Vector3d> arm(parameters[kMounting] + 3);
     InertialMotion::OfSensor sensor;
     sensor << Eigen::Map<const Vector6>(parameters[kBiases]), Eigen::Map<const Vector6>(parameters[kScales]),
-        *parameters[kClock];
+        Eigen::Map<const Vector6>(parameters[kCrossAxes]), *parameters[kClock];
 
     const double dt = motion_.interval;
     const Eigen::Matrix3d mounted = rig_from_imu_ * Exponential(turn);
@@ -129,6 +130,7 @@ class InertialCost final : public ceres::CostFunction {
     by_sensor = (by_error * by_sensor).eval();
     Write<6>(kBiases, by_sensor.leftCols<6>(), jacobians);
     Write<6>(kScales, by_sensor.middleCols<6>(6), jacobians);
+    Write<6>(kCrossAxes, by_sensor.middleCols<6>(12), jacobians);
     Write<1>(kClock, by_sensor.rightCols<1>(), jacobians);
     Eigen::Matrix<double, kNum, 6> by_turn_and_arm = Eigen::Matrix<double, kNum, 6>::Zero();
     // A change of the rotation vector turns the mounting in its own frame by the right Jacobian.
@@ -150,10 +152,11 @@ class InertialCost final : public ceres::CostFunction {
     kGravity,
     kBiases,
     kScales,
+    kCrossAxes,
     kClock,
     kMounting
   };
-  static constexpr std::array<int, 9> kSizes = {7, 7, 3, 3, 3, 6, 6, 1, 6};
+  static constexpr std::array<int, 10> kSizes = {7, 7, 3, 3, 3, 6, 6, 6, 1, 6};
 
   // COLMAP's rig_from_world.
   struct Pose {

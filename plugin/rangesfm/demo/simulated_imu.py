@@ -59,6 +59,7 @@ class Grade:
         gyro_bias, accel_bias: standard deviations of the zeros, rad/s and m/s^2. gyro_walk, accel_walk: of their random
             walks after a second.
         scale: standard deviation of the scale factor of each axis of the accelerometer; a tenth of it of the gyroscope.
+        cross: standard deviation of the share by which an axis of the accelerometer reads of each other.
     """
 
     gyro_noise: float
@@ -68,6 +69,7 @@ class Grade:
     gyro_walk: float
     accel_walk: float
     scale: float = 0.03
+    cross: float = 0.01
 
 
 PHONE = Grade(2e-4, 3e-3, 0.015, 0.1, 1e-5, 5e-4)
@@ -83,8 +85,14 @@ def simulate_imu(motion: ImuMotion, times_s: Array, rate_hz: float, grade: Grade
     walked = rng.normal(size=(2, *gyro.shape)).cumsum(axis=1) / np.sqrt(rate_hz)
     zeros, scales = rng.normal(size=(2, 2, 3))
     noise = rng.normal(size=(2, *gyro.shape)) * np.sqrt(rate_hz)
+    cross = grade.cross * rng.normal(size=(3, 3)) * (1 - np.eye(3))
     gyro = (1 + 0.1 * grade.scale * scales[0]) * gyro + grade.gyro_bias * zeros[0] + grade.gyro_walk * walked[0]
-    force = (1 + grade.scale * scales[1]) * force + grade.accel_bias * zeros[1] + grade.accel_walk * walked[1]
+    force = (
+        (1 + grade.scale * scales[1]) * force
+        + force @ cross.T
+        + grade.accel_bias * zeros[1]
+        + grade.accel_walk * walked[1]
+    )
     return ImuLog(times_s, gyro + grade.gyro_noise * noise[0], force + grade.accel_noise * noise[1])
 
 

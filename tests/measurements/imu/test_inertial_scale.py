@@ -68,6 +68,19 @@ def test_the_upward_direction_is_known_to_less_than_half_a_degree() -> None:
     assert np.max(errors) < 4
 
 
+def test_axes_that_are_not_at_right_angles_neither_tilt_the_map_nor_hide_its_scale() -> None:
+    problem = posed(by_hand(1, axes=(3.0, 3.0, 3.0)), np.zeros(3))
+    across = np.array([[0.0, 0.02, -0.01], [-0.01, 0.0, 0.02], [0.02, 0.01, 0.0]])
+    log = replace(problem.log, accel_m_s2=problem.log.accel_m_s2 @ (np.eye(3) + across).T)
+    right, wrong = (
+        scale_by_sensor(replace(problem, log=each), WalkBending(problem.path)) for each in (problem.log, log)
+    )
+    assert wrong.alone.uncertainty.half_width_95 < 1.2 * right.alone.uncertainty.half_width_95
+    assert wrong.alone.scale.value == pytest.approx(right.alone.scale.value, rel=0.002)
+    apart = np.linalg.norm(wrong.upward.up_in_first_camera - right.upward.up_in_first_camera)
+    assert apart < right.upward.stddev_rad
+
+
 def test_a_log_of_another_day_is_refused() -> None:
     problem = posed(by_hand(), np.zeros(3))
     later = replace(problem.log, timestamp_s=problem.log.timestamp_s + 86400.0)

@@ -20,7 +20,11 @@ Array = npt.NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.8
 DENSITIES = np.array([2e-3, 2e-2])
-SENSOR = np.concatenate([[0.02, -0.01, 0.03], [0.2, -0.1, 0.3], [0.01, -0.02, 0.01], [0.03, 0.02, -0.03], [0.004]])
+OF_SENSOR = (
+    *([0.02, -0.01, 0.03], [0.2, -0.1, 0.3], [0.01, -0.02, 0.01], [0.03, 0.02, -0.03]),
+    *([0.01, -0.02, 0.01], [0.02, -0.01, 0.01], [0.004]),
+)
+SENSOR = np.concatenate(OF_SENSOR)
 PHOTO_S = np.array([0.3, 0.55, 1.2, 2.0])
 
 
@@ -109,7 +113,7 @@ def test_what_a_state_costs_is_what_it_costs_in_gtsam() -> None:
             expected = 0.5 * expected @ np.linalg.solve(sums.residualCovariance(), expected)
             blocks = [colmaps(end) for end, _ in ends] + [velocity for _, velocity in ends]
             gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
-            residuals = cost.evaluate(*blocks, gravity, biases, np.zeros(6), np.zeros(1), np.zeros(6))[0]
+            residuals = cost.evaluate(*blocks, gravity, biases, *map(np.zeros, (6, 6, 1, 6)))[0]
             assert 0.5 * np.sum(np.square(residuals)) == pytest.approx(expected, rel=0.05)
 
 

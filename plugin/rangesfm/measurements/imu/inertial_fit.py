@@ -42,9 +42,9 @@ from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE
 from rangesfm.util.geometry.rotations import logarithms
 from rangesfm.util.geometry.trajectory import Trajectory
 
-SCALE, GRAVITY, SENSOR, TURN, ARM = slice(0, 1), slice(1, 4), slice(4, 17), slice(17, 20), slice(20, 23)
+SCALE, GRAVITY, SENSOR, TURN, ARM = slice(0, 1), slice(1, 4), slice(4, 23), slice(23, 26), slice(26, 29)
 """What all intervals share: logarithm of the scale, gravity, the sensor's numbers, turn and place of the mounting."""
-NUM_SHARED = 23
+NUM_SHARED = 29
 # Largest number of intervals in a stretch; the time for a stretch grows with its cube.
 _MAX_NUM_IN_STRETCH = 20
 
@@ -58,7 +58,7 @@ class InertialState:
 
     Attributes:
         scale: metres per unit of the path. velocities_m_s: (n, 3). gravity_m_s2: (3,) in the path's world.
-        sensor: (13,). mounting: of the sensor.
+        sensor: (19,). mounting: of the sensor.
         weights: (n,) of the intervals after each photo, robust.
     """
 
@@ -176,7 +176,7 @@ class InertialProblem:
         return np.column_stack([in_rig, state.velocities_m_s - np.einsum("nij,nj->ni", self.path.world_from_cam, arms)])
 
     def off_prior(self, state: InertialState) -> Array:
-        """Return the (23,) differences of the shared numbers from what was known of them; 0 where nothing was."""
+        """Return the (29,) differences of the shared numbers from what was known of them; 0 where nothing was."""
         off = np.zeros(NUM_SHARED)
         off[SENSOR] = state.sensor
         off[TURN] = logarithms((self.mounting.rig_from_imu.T @ state.mounting.rig_from_imu)[None])[0]
@@ -219,7 +219,7 @@ class InertialProblem:
         return found, stddev
 
     def _priors(self, state: InertialState) -> tuple[Array, Array]:
-        """Return the (r, 23) derivatives and the (r,) residuals, in standard deviations, of what was known before."""
+        """Return the (r, 29) derivatives and the (r,) residuals, in standard deviations, of what was known before."""
         stddevs = np.full(NUM_SHARED, np.inf)
         stddevs[SENSOR], stddevs[TURN], stddevs[ARM] = self.prior.of_sensor, self.prior.turn_rad, self.prior.arm_m
         known = np.isfinite(stddevs)
@@ -235,7 +235,7 @@ class LinearMotion:
 
     Attributes:
         state, intervals, errors: at which, of what, and predicted minus measured.
-        shared: (k, 9, 23) derivatives by what all intervals share.
+        shared: (k, 9, 29) derivatives by what all intervals share.
         late: (k, 9, 2, 1) by how much later than said the photos before and after were taken.
     """
 
@@ -320,7 +320,7 @@ class Stretch:
 
     Attributes:
         rows: (m,) of the intervals. before: (m,) photos before each. photos: (q,) all of them.
-        residual: (9 m,). shared: (9 m, 23). lower: (9 m, 9 m) Cholesky factor of their covariance.
+        residual: (9 m,). shared: (9 m, 29). lower: (9 m, 9 m) Cholesky factor of their covariance.
         by_velocity: (9 m, 3 q).
         combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1.
     """
@@ -370,7 +370,7 @@ class Stretch:
         return self.residual + self.shared @ step
 
     def velocities(self, step: Array) -> Array:
-        """Return the (q, 3) most likely changes of the velocities after a step (23,) of the shared numbers."""
+        """Return the (q, 3) most likely changes of the velocities after a step (29,) of the shared numbers."""
         whitened = solve_triangular(self.lower, np.column_stack([self.by_velocity, self._left(step)]), lower=True)
         basis, upper = np.linalg.qr(whitened[:, :-1])
         return -np.asarray(solve_triangular(upper, basis.T @ whitened[:, -1])).reshape(-1, 3)

@@ -12,7 +12,8 @@ from rangesfm import solver
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialState
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
-from rangesfm.measurements.imu.preintegration import ACCEL_BIAS, ACCEL_SCALE, GYRO_BIAS, GYRO_SCALE, Preintegrated
+from rangesfm.measurements.imu.preintegration import ACCEL_CROSS, BIASES, SCALES, Preintegrated
+from rangesfm.measurements.imu.preintegration import CLOCK as LATE
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, SensorPrior
 from rangesfm.measurements.kind import (
     LEAST_SQUARES,
@@ -31,6 +32,7 @@ from rangesfm.util.geometry.rotations import left_jacobians, logarithms
 
 GRAVITY: Block = ("gravity", "imu")
 SCALE_ERRORS: Block = ("scale_errors", "imu")
+CROSS_AXES: Block = ("cross_axes", "imu")
 CLOCK: Block = ("clock", "imu")
 MOUNTING: Block = ("mounting", "imu")
 
@@ -40,7 +42,8 @@ class InertialMotions(Measurements):
     """Motions of the sensor in k intervals between photos.
 
     Blocks are the sensor's velocity (3,) at each of these photos, gravity (3,), biases (6,) of gyroscope
-    and accelerometer in each stretch of time, shares (6,) by which their axes read too much, by how much later than
+    and accelerometer in each stretch of time, shares (6,) by which their axes read too much, shares (6,) by which
+    those of the accelerometer read of others, by how much later than
     assumed it measured (1,), and its mounting (6,), a rotation vector in its own frame and its place in the rig.
 
     Attributes:
@@ -77,9 +80,9 @@ class InertialMotions(Measurements):
     def priors(self) -> Iterator[Measurements]:
         """Yield what is known of the blocks."""
         stddevs, known = self.prior.of_sensor, self.prior
-        scale_errors = np.concatenate([stddevs[GYRO_SCALE], stddevs[ACCEL_SCALE]])
-        yield Prior.of_one(self._biases[0], np.zeros(6), np.concatenate([stddevs[GYRO_BIAS], stddevs[ACCEL_BIAS]]))
-        yield Prior.of_one(SCALE_ERRORS, np.zeros(6), scale_errors)
+        yield Prior.of_one(self._biases[0], np.zeros(6), stddevs[BIASES])
+        yield Prior.of_one(SCALE_ERRORS, np.zeros(6), stddevs[SCALES])
+        yield Prior.of_one(CROSS_AXES, np.zeros(6), stddevs[ACCEL_CROSS])
         yield Prior.of_one(CLOCK, np.zeros(1), known.clock_s)
         place = np.concatenate([np.zeros(3), self.mounting.imu_in_rig_m])
         yield Prior.of_one(MOUNTING, place, np.repeat([known.turn_rad, known.arm_m], 3))
@@ -101,7 +104,7 @@ class InertialMotions(Measurements):
         names = tuple(velocity_block(photo) for photo in photos.tolist())
         velocities[photos] = [blocks[name] for name in names]
         biases, mounting = np.array([blocks[name] for name in self._biases]), blocks[MOUNTING]
-        of_all = np.tile(np.concatenate([blocks[SCALE_ERRORS], blocks[CLOCK]]), (num, 1))
+        of_all = np.tile(np.concatenate([blocks[name] for name in (SCALE_ERRORS, CROSS_AXES, CLOCK)]), (num, 1))
         found = MotionErrors.at(
             at,
             state.poses,
@@ -116,9 +119,10 @@ class InertialMotions(Measurements):
             ByBlock(names, np.searchsorted(photos, at.before), found.by_velocity[:, :, 0]),
             ByBlock(names, np.searchsorted(photos, at.after), found.by_velocity[:, :, 1]),
             ByBlock((GRAVITY,), all_of_one, found.by_gravity),
-            ByBlock(self._biases, self.stretch, found.by_sensor[:, :, :6]),
-            ByBlock((SCALE_ERRORS,), all_of_one, found.by_sensor[:, :, 6:12]),
-            ByBlock((CLOCK,), all_of_one, found.by_sensor[:, :, 12:]),
+            ByBlock(self._biases, self.stretch, found.by_sensor[:, :, BIASES]),
+            ByBlock((SCALE_ERRORS,), all_of_one, found.by_sensor[:, :, SCALES]),
+            ByBlock((CROSS_AXES,), all_of_one, found.by_sensor[:, :, ACCEL_CROSS]),
+            ByBlock((CLOCK,), all_of_one, found.by_sensor[:, :, LATE]),
             ByBlock((MOUNTING,), all_of_one, by_mounting),
         )
         return Linearization(found.residual, np.column_stack([at.before, at.after]), found.by_pose, by_block)
@@ -140,7 +144,7 @@ class InertialMotions(Measurements):
             )
             velocities = [blocks[velocity_block(photo)] for photo in (before, after)]
             biases = blocks[bias_block(int(self.stretch[k]))]
-            further = [blocks[GRAVITY], biases, *(blocks[name] for name in (SCALE_ERRORS, CLOCK, MOUNTING))]
+            further = [blocks[GRAVITY], biases, *(blocks[name] for name in (SCALE_ERRORS, CROSS_AXES, CLOCK, MOUNTING))]
             solver.add_residual_block(
                 adjustment.adjuster, cost, None, [poses[before], poses[after], *velocities, *further]
             )
@@ -256,11 +260,12 @@ class InertialLog(Source):
         middles_s = np.bincount(stretch, times_s) / np.bincount(stretch)
         photos = np.union1d(photo, self.intervals.after).tolist()
         start = {velocity_block(k): state.velocities_m_s[k] for k in photos}
-        start |= {bias_block(k): state.sensor[:6] for k in range(len(middles_s))}
+        start |= {bias_block(k): state.sensor[BIASES] for k in range(len(middles_s))}
         start |= {
             GRAVITY: state.gravity_m_s2,
-            SCALE_ERRORS: state.sensor[6:12],
-            CLOCK: state.sensor[12:],
+            SCALE_ERRORS: state.sensor[SCALES],
+            CROSS_AXES: state.sensor[ACCEL_CROSS],
+            CLOCK: state.sensor[LATE],
         }
         turn = logarithms((before.rig_from_imu.T @ now.rig_from_imu)[None])[0]
         start[MOUNTING] = np.concatenate([turn, now.imu_in_rig_m])

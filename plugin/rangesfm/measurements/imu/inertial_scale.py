@@ -25,6 +25,7 @@ from rangesfm.measurements.imu.inertial_motions import InertialLog
 from rangesfm.measurements.imu.preintegration import (
     ACCEL,
     ACCEL_BIAS,
+    ACCEL_CROSS,
     ACCEL_SCALE,
     CLOCK,
     GYRO,
@@ -201,7 +202,7 @@ class InertialScale(KindOnMap):
         """Yield the errors of observations, those of one standard deviation where it is learnt.
 
         Args:
-            by_pose: (c, n, 6). of_shared: (c, 23) derivatives by what is shared.
+            by_pose: (c, n, 6). of_shared: (c, 29) derivatives by what is shared.
         """
         motion, prior, num = made.motion, self.problem.prior, len(by_pose)
         times_s = self.problem.times_s[motion.intervals.before]
@@ -227,6 +228,7 @@ class InertialScale(KindOnMap):
             ("accel_bias", of_sensor[:, ACCEL_BIAS], prior.accel_bias_m_s2),
             ("gyro_scale", of_sensor[:, GYRO_SCALE], prior.gyro_scale),
             ("accel_scale", of_sensor[:, ACCEL_SCALE], prior.accel_scale),
+            ("accel_cross", of_sensor[:, ACCEL_CROSS], prior.accel_cross),
             ("imu_clock", of_sensor[:, CLOCK], prior.clock_s),
             ("imu_turn", of_shared[:, TURN], prior.turn_rad),
             ("imu_place", of_shared[:, ARM], prior.arm_m),

@@ -38,7 +38,7 @@ class MotionErrors:
         by_pose: (k, 9, 2, 6) derivatives by turn of the rig in its own frame and shift, of the photos before and after.
         by_velocity: (k, 9, 2, 3) by the sensor's velocity in the world at either photo, m/s.
         by_gravity: (k, 9, 3) by gravity in the world, m/s^2.
-        by_sensor: (k, 9, 13) by the sensor's numbers (see ``Preintegrated``).
+        by_sensor: (k, 9, 19) by the sensor's numbers (see ``Preintegrated``).
         by_turn, by_arm: (k, 9, 3) by a turn of the mounting in the sensor's frame, and by its place.
     """
 
@@ -63,7 +63,7 @@ class MotionErrors:
         """Return the errors at a state of a metric map.
 
         Args:
-            velocities_m_s: (n, 3) of the sensor at the n photos. gravity_m_s2: (3,). sensor: (k, 13).
+            velocities_m_s: (n, 3) of the sensor at the n photos. gravity_m_s2: (3,). sensor: (k, 19).
         """
         before, after, num = measured.before, measured.after, len(measured)
         dt = measured.interval_s[:, None]

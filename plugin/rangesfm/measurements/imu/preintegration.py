@@ -18,9 +18,14 @@ GYRO, ACCEL = 0, 1
 """The two sensors, in arrays that have one entry for each."""
 TURN, SPEED, SHIFT = slice(0, 3), slice(3, 6), slice(6, 9)
 """The nine numbers of an interval."""
-GYRO_BIAS, ACCEL_BIAS, GYRO_SCALE, ACCEL_SCALE, CLOCK = (slice(3 * k, min(3 * k + 3, 13)) for k in range(5))
-"""The thirteen numbers of the sensor."""
-NUM_OF_SENSOR = 13
+GYRO_BIAS, ACCEL_BIAS, GYRO_SCALE, ACCEL_SCALE = (slice(3 * k, 3 * k + 3) for k in range(4))
+ACCEL_CROSS, CLOCK = slice(12, 18), slice(18, 19)
+"""The nineteen numbers of the sensor."""
+BIASES, SCALES = slice(0, 6), slice(6, 12)
+"""Those of both sensors together."""
+NUM_OF_SENSOR = 19
+# Axes of the accelerometer, and those of which they read a share (``ACCEL_CROSS``).
+_AXES, _OF_AXES = np.array([0, 0, 1, 1, 2, 2]), np.array([1, 2, 0, 2, 0, 1])
 # Beyond this standard deviation of a turn, radians, the first-order corrections of what was summed up after it are off
 # by more than half a percent (the next term is half its square).
 _MAX_TURN_STDDEV_RAD = 0.1
@@ -31,16 +36,17 @@ class Preintegrated:
     """Motion of the sensor in k intervals between photos, in its own frame at the start of each.
 
     The sensor's numbers b are: biases of the gyroscope (3, rad/s) and of the accelerometer (3, m/s^2), shares by which
-    their axes read too much (3 and 3), and how much later than assumed it measured, seconds. True are
-    ``(1 - share) * reading - bias``.
+    their axes read too much (3 and 3), shares by which those of the accelerometer read of others (6: x of y, x of z, y
+    of x, y of z, z of x, z of y), as they are not at right angles or not along those of the gyroscope, and how much
+    later than assumed it measured, seconds. True are ``reading - shares @ reading - bias``.
 
     Attributes:
         before, after: (k,) indices of the photos. interval_s: (k,) between them.
         turn: (k, 3, 3) rotations from the sensor's frame at the end into that at the start.
         speed: (k, 3) m/s, change of the velocity without gravity. shift: (k, 3) m, the same of the position, beyond
             that of the velocity at the start.
-        at: (k, 13) numbers of the sensor at which it was summed up.
-        by_sensor: (k, 9, 13) derivatives of turn (in its own frame, at its end), speed and shift by these.
+        at: (k, 19) numbers of the sensor at which it was summed up.
+        by_sensor: (k, 9, 19) derivatives of turn (in its own frame, at its end), speed and shift by these.
         unit_covariance: (2, k, 9, 9) covariance for a noise density of 1 of the gyroscope (rad/s/sqrt(Hz)), and of the
             accelerometer (m/s^2/sqrt(Hz)).
         of_gaps: (k, 9, 9) covariance of what the log does not say in its gaps.
@@ -72,7 +78,7 @@ class Preintegrated:
         return np.asarray(np.einsum("s,skij->kij", np.square(densities), self.unit_covariance) + self.of_gaps)
 
     def corrected(self, sensor: Array) -> tuple[Array, Array, Array]:
-        """Return turns, speeds and shifts for other (k, 13) numbers of the sensor, to first order in these."""
+        """Return turns, speeds and shifts for other (k, 19) numbers of the sensor, to first order in these."""
         change = np.einsum("kij,kj->ki", self.by_sensor, sensor - self.at)
         turn = self.turn @ exponentials(change[:, TURN])
         return turn, self.speed + change[:, SPEED], self.shift + change[:, SHIFT]
@@ -93,7 +99,7 @@ def preintegrate(
     Args:
         timestamp_s, gyro_rad_s, accel_m_s2: (m,), (m, 3), (m, 3) of the log, at least two samples.
         photo_s: (n,) times of the photos on the sensor's clock, in any order of equal or rising times.
-        sensor: (13,) or (n - 1, 13) numbers of the sensor; None: 0.
+        sensor: (19,) or (n - 1, 19) numbers of the sensor; None: 0.
         densities: (2,) noise densities with which a turn must be known; None: only gaps count.
     """
     samples, log = np.column_stack([gyro_rad_s, accel_m_s2]), np.asarray(timestamp_s, dtype=np.float64)
@@ -164,6 +170,8 @@ class _Sums:
         biases = np.concatenate([sensors[:, GYRO_BIAS], sensors[:, ACCEL_BIAS]], axis=1)
         self._readings, self._steps_s = readings, steps_s
         self._true = gains[:, None] * readings - biases[:, None]
+        for share, axis, other in zip(sensors[:, ACCEL_CROSS].T, _AXES, _OF_AXES, strict=True):
+            self._true[:, :, 3 + axis] -= share[:, None] * readings[:, :, 3 + other]
         self.turn = np.tile(np.eye(3), (num, 1, 1))
         self.speed, self.shift = np.zeros((2, num, 3))
         self.by_sensor = np.zeros((num, 9, NUM_OF_SENSOR))
@@ -200,6 +208,7 @@ class _Sums:
         self.by_sensor[:, :, ACCEL_BIAS] -= by_force
         self.by_sensor[:, :, GYRO_SCALE] -= by_rate * rate_read[:, None]
         self.by_sensor[:, :, ACCEL_SCALE] -= by_force * force_read[:, None]
+        self.by_sensor[:, :, ACCEL_CROSS] -= by_force[:, :, _AXES] * force_read[:, None, _OF_AXES]
         self.covariance = by_state @ self.covariance @ np.swapaxes(by_state, 1, 2)
         per_s = np.divide(1.0, dt, out=np.zeros_like(dt), where=dt > 0)[:, :, None]
         of_rate, of_force = (by @ np.swapaxes(by, 1, 2) for by in (by_rate, by_force))

@@ -11,6 +11,7 @@ from rangesfm.measurements.imu.log import ImuNoise
 from rangesfm.measurements.imu.preintegration import (
     ACCEL,
     ACCEL_BIAS,
+    ACCEL_CROSS,
     ACCEL_SCALE,
     CLOCK,
     GYRO,
@@ -71,6 +72,7 @@ class SensorPrior:
     Attributes:
         gyro_bias_rad_s, accel_bias_m_s2: offsets at zero (BMI160: 3 deg/s, 40 mg; MPU-9250: 5 deg/s, 60 to 80 mg).
         gyro_scale, accel_scale: shares by which an axis reads too much (MPU-9250, product specification 1.1: 3 % each).
+        accel_cross: share by which it reads of another ("cross-axis sensitivity"; BMI160: 1 %, MPU-9250: 2 %).
         clock_s: of the offset between the clocks of sensor and photos.
         turn_rad, arm_m: of the mounting's rotation, and of its place.
         noise, walk: of gyroscope and accelerometer.
@@ -83,6 +85,7 @@ class SensorPrior:
     accel_bias_m_s2: float = 0.5
     gyro_scale: float = 0.03
     accel_scale: float = 0.03
+    accel_cross: float = 0.01
     noise: tuple[KnownSize, KnownSize] = NOISE
     walk: tuple[KnownSize, KnownSize] = WALK
 
@@ -97,9 +100,9 @@ class SensorPrior:
 
     @property
     def of_sensor(self) -> Array:
-        """(13,) of the sensor's numbers."""
+        """(19,) of the sensor's numbers."""
         found = np.empty(NUM_OF_SENSOR)
         found[GYRO_BIAS], found[ACCEL_BIAS] = self.gyro_bias_rad_s, self.accel_bias_m_s2
         found[GYRO_SCALE], found[ACCEL_SCALE] = self.gyro_scale, self.accel_scale
-        found[CLOCK] = self.clock_s
+        found[ACCEL_CROSS], found[CLOCK] = self.accel_cross, self.clock_s
         return found

@@ -266,6 +266,7 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         "accel_bias_walk": "wandering of the accelerometer's zero",
         "accel_bias": "zero of the accelerometer",
         "accel_scale": "scale factors of the accelerometer",
+        "accel_cross": "angles between the axes of the accelerometer",
         "photo_times": "times of the photos against the inertial sensor",
         "pose_turns": "noise of the photos' turns",
         "pose_places": "noise of the photos' places",
