@@ -1,0 +1,184 @@
+"""Find which named numbers of the program decide results, by doubling each in turn.
+
+Run: python -m tests.studies.deciding_numbers [--rooms measurements solver ...] [--out FILE]
+
+A number is a constant at the top of a module, or one of a mapping or a tuple there. Each is doubled alone, wherever it
+was imported to, and five small surveys are run again: a hall with a radio from the population and photos; a lap that
+drifts by 2 m with one anchor; poses without points; a yard with ranges, positions and control points; and a room with
+control points alone. What other constants or default arguments were computed from it at import stays.
+
+Prints the numbers that move a result, those that move most first: the largest change of a scale in its stddevs, the
+largest change of a half width (ratio), of a keyframe's place in the map's stated stddevs, and verdicts that change or
+surveys that fail. Those that move nothing by more than 1 % of a stddev are listed by name. With --out each is a line of
+a file, and those that are there already are not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import json
+import pkgutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from tests.simulated.runs import run_stages
+from tests.simulated.surveys import simulated
+from tests.studies import drifting_maps, known_positions
+from tests.studies.measured_distances import KINDS
+
+import rangesfm
+from rangesfm.errors import RangesfmError
+from rangesfm.pipeline.metric_result import MetricResult
+
+ROOMS = ("solver", "measurements", "estimation", "diagnostics", "pipeline", "util")
+MOVES_NOTHING = 0.01
+Line = dict[str, Any]
+Number = tuple[str, str, str]
+
+
+def surveys() -> dict[str, Callable[[], MetricResult]]:
+    """Functions that run a survey, by name."""
+
+    def known(names: str, kind: str) -> Callable[[], MetricResult]:
+        truth, survey = simulated(replace(KINDS[kind], anchor_frame="site"), 0)
+        of_survey = known_positions.Known.of(names.split("+"), truth, survey, KINDS[kind].path(0), 0)
+        return lambda: of_survey.run(of_survey.surveyed, 0)
+
+    made = {
+        "hall": drifting_maps.hall(0),
+        "lap": drifting_maps.lap_of_drift(2.0, 0, num_keyframes=100),
+        "poses": drifting_maps.without_points(
+            drifting_maps.lap_of_drift(2.0, 0, "site", with_radio=True, num_keyframes=100)
+        ),
+    }
+    found: dict[str, Callable[[], MetricResult]] = {
+        name: lambda survey=survey: run_stages(survey, 0)  # type: ignore[misc]
+        for name, survey in made.items()
+    }
+    return {
+        **found,
+        "all": known("points+positions+ranges+anchors", "yard"),
+        "points": known("points", "room"),
+    }
+
+
+def numbers(rooms: tuple[str, ...]) -> Iterator[Number]:
+    """Yield the module, the name and the key (or nothing) of each number."""
+    for info in pkgutil.walk_packages(rangesfm.__path__, "rangesfm."):
+        if info.name.split(".")[1] not in rooms or ".readers" in info.name:
+            continue
+        module = importlib.import_module(info.name)
+        source = Path(str(module.__file__))
+        if source.suffix != ".py":
+            continue
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
+            for name in (each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)):
+                value = getattr(module, name, None)
+                if is_number(value):
+                    yield info.name, name, ""
+                elif isinstance(value, Mapping):
+                    yield from ((info.name, name, str(key)) for key, one in value.items() if is_number(one))
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value not in (0, 1) and abs(value) < 1e15
+
+
+def doubled(number: Number) -> Line:
+    """Return the modules' attributes to be patched, by module and name."""
+    module, name, key = number
+    value = getattr(sys.modules[module], name)
+    twice = {**value, key: 2 * value[key]} if key else 2 * value
+    return {
+        f"{each}.{name}": twice
+        for each, at in list(sys.modules.items())
+        if each.startswith("rangesfm.") and getattr(at, name, None) is value
+    }
+
+
+def compared(before: MetricResult, after: MetricResult) -> Line:
+    """Return the changes of scale, half width and place."""
+    first, second = before.estimate, after.estimate
+    stddev = first.uncertainty.empirical
+    centers_m = [each.trajectory.as_in(each.final).centers for each in (before, after)]
+    size_m = float(np.linalg.norm(centers_m[0].std(axis=0)))
+    stated_m = before.place.worst_keyframe_stddev_m if before.place is not None else stddev * size_m
+    return {
+        "scale": abs(float(np.log(second.value / first.value))) / stddev,
+        "half_width": float(second.uncertainty.half_width_95 / first.uncertainty.half_width_95),
+        "place": float(np.linalg.norm(centers_m[1] - centers_m[0], axis=1).max()) / stated_m,
+        "verdict": "" if first.verdict == second.verdict else f"{first.verdict} -> {second.verdict}",
+    }
+
+
+def effect(number: Number, runs: Mapping[str, Callable[[], MetricResult]], usual: Mapping[str, MetricResult]) -> Line:
+    """Return the largest changes over the surveys, with the number doubled."""
+    changes, said = [], []
+    patches = [patch(at, twice) for at, twice in doubled(number).items()]
+    for each in patches:
+        each.start()
+    try:
+        for name, run in runs.items():
+            try:
+                change = compared(usual[name], run())
+            except (RangesfmError, np.linalg.LinAlgError, ValueError, IndexError) as error:
+                said.append(f"{name}: {error}")
+                continue
+            changes.append(change)
+            said += [f"{name}: {change['verdict']}"] if change["verdict"] else []
+    finally:
+        for each in patches:
+            each.stop()
+    widths = [change["half_width"] for change in changes] or [1.0]
+    return {
+        "number": list(number),
+        "scale": max((change["scale"] for change in changes), default=0.0),
+        "half_width": max(widths, key=lambda ratio: abs(np.log(ratio))),
+        "place": max((change["place"] for change in changes), default=0.0),
+        "said": said,
+    }
+
+
+def size_of(line: Line) -> float:
+    return float(max(line["scale"], line["place"], abs(np.log(line["half_width"])), bool(line["said"])))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", nargs="*", default=list(ROOMS))
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
+    lines = [json.loads(line) for line in known]
+    done, runs = {tuple(line["number"]) for line in lines}, surveys()
+    usual = {name: run() for name, run in runs.items()}
+    for number in numbers(tuple(args.rooms)):
+        if number in done:
+            continue
+        lines.append(effect(number, runs, usual))
+        print(json.dumps(lines[-1]), flush=True)
+        if args.out is not None:
+            with args.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(lines[-1]) + "\n")
+    lines.sort(key=size_of, reverse=True)
+    print("number, change of a scale (stddevs), of a half width (ratio), of a place (stddevs), verdicts")
+    for line in (line for line in lines if size_of(line) > MOVES_NOTHING):
+        name = ".".join(filter(None, line["number"]))
+        print(f"{name}: {line['scale']:.2f}, {line['half_width']:.3f}, {line['place']:.2f}, {'; '.join(line['said'])}")
+    print(
+        "move nothing: " + ", ".join(".".join(filter(None, each["number"])) for each in lines if size_of(each) <= 0.01)
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
