@@ -183,6 +183,22 @@ def phyphox(folder: Path) -> Path:
     return path
 
 
+def gopro(folder: Path) -> Path:
+    """The tables that GoPro Telemetry Extractor writes."""
+    path = folder / "gopro"
+    path.mkdir()
+    dates = np.datetime64("2026-05-04T10:00:00.000") + np.round(1e3 * LOG.timestamp_s).astype("timedelta64[ms]")
+    for track, what, unit, values in (
+        ("ACCL", "Accelerometer", "m/s2", LOG.accel_m_s2),
+        ("GYRO", "Gyroscope", "rad/s", LOG.gyro_rad_s),
+    ):
+        header = ",".join(["cts,date", *(f"{what} ({axis}) [{unit}]" for axis in "zxy"), "temperature [°C]"])
+        rows = zip(1e3 * LOG.timestamp_s, dates, *values[:, [2, 0, 1]].T, strict=True)
+        lines = [f"{cts:.6f},{date}Z,{z:.9f},{x:.9f},{y:.9f},31.5" for cts, date, z, x, y in rows]
+        (path / f"GH010042_HERO9 Black-{track}.csv").write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
 def bag(folder: Path) -> Path:
     vector, quaternion = (TYPES[2].types[f"geometry_msgs/msg/{name}"] for name in ("Vector3", "Quaternion"))
     unknown = {f"{name}_covariance": np.zeros(9) for name in ("orientation", "angular_velocity", "linear_acceleration")}
@@ -199,7 +215,7 @@ def bag(folder: Path) -> Path:
 
 FORMATS = (
     *(canonical, euroc, euroc_without_header, kalibr, inrol, mars_since_boot, physics_toolbox, androsensor, rostopic),
-    *(degrees_and_g, android, ios, ios_uncalibrated, zipped, phyphox, bag),
+    *(degrees_and_g, android, ios, ios_uncalibrated, zipped, phyphox, gopro, bag),
 )
 
 
@@ -282,6 +298,12 @@ def test_what_cannot_be_used_is_refused_with_its_place(name: str, tmp_path: Path
     change, text = REFUSED[name]
     with pytest.raises(InputError, match=text):
         read_imu(changed(canonical(tmp_path), change))
+
+
+def test_a_video_is_refused_with_the_way_to_its_tables(tmp_path: Path) -> None:
+    (tmp_path / "GX010042.MP4").write_bytes(b"\0\0\0\x20ftypmp41" + bytes(64))
+    with pytest.raises(InputError, match=r"GX010042\.MP4: is a video, .*ACCL and GYRO"):
+        read_imu(tmp_path / "GX010042.MP4")
 
 
 def test_few_samples_a_second_are_said(tmp_path: Path) -> None:

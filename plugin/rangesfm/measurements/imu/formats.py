@@ -2,7 +2,7 @@
 
 They may be tables of any layout (the canonical one, EuRoC, TUM-VI, kalibr, Physics Toolbox, phyphox, AndroSensor,
 MARS, ``rostopic echo``), a folder or a zip archive with a table for each of gyroscope and accelerometer (Sensor Logger,
-phyphox), or ROS bags with ``sensor_msgs/Imu``.
+phyphox, GoPro Telemetry Extractor), or ROS bags with ``sensor_msgs/Imu``.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ _FULL_SCALES_M_S2 = STANDARD_GRAVITY_M_S2 * np.array([2.0, 4.0, 8.0, 16.0])
 _FULL_SCALES_RAD_S = np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0])
 _FULL_SCALE_ERROR = 0.03
 _TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
+_VIDEOS = (".mp4", ".mov", ".360", ".lrv", ".insv")
 _LARGEST_BYTES = 1 << 31  # of a table in an archive
 
 
@@ -89,6 +90,11 @@ def read_imu(path: Path) -> ImuLog:
         InputError: there is no gyroscope or no accelerometer with gravity in it, times go back, or too few samples are
             left. The error gives the line if there is one.
     """
+    if path.suffix.lower() in _VIDEOS and path.is_file():
+        expected = (
+            "export it as CSV (GoPro: goprotelemetryextractor.com, ACCL and GYRO), and give the folder of the tables"
+        )
+        raise InputError(f"is a video, and the track of the sensor in it is not read: {expected}", path)
     notes = list[str]()
     if is_bag(path):
         signals = _signals_of_bag(path)

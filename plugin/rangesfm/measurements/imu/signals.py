@@ -28,6 +28,7 @@ _NO_SIGNAL = _words(
     "magnetometer magnetic magneto mag compass orientation quaternion attitude euler bias var variance cov covariance "
     "std stddev sigma b roll pitch yaw position temperature temp t p"
 )
+_AXIS_IN_BRACKETS = re.compile(r"\(([xyz])\)", re.IGNORECASE)  # "Accelerometer (x) [m/s2]", as of GoPro's tracks
 _IN_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]")
 _AXIS_AT_END = re.compile(r"([a-z]{0,14})([xyz])")
 _DEGREES = re.compile(r"deg|dps|\u00b0", re.IGNORECASE)
@@ -73,6 +74,7 @@ def find_triples(names: Sequence[str]) -> Iterator[Triple]:
 
 def _split(name: str) -> tuple[list[str], list[str]]:
     """Return the words of a name, and those in brackets, which are its unit."""
+    name = _AXIS_IN_BRACKETS.sub(r" \1 ", name)
     return words_of(_IN_BRACKETS.sub(" ", name)), [part.lower() for part in _IN_BRACKETS.findall(name)]
 
 
