@@ -15,6 +15,7 @@ from rangesfm.measurements.positions.grouped_positions import design_of_position
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_scale import (
     _determine,
+    _doubts_of_axes,
     _Search,
     refuse_open_turn,
     scale_by_positions,
@@ -113,3 +114,19 @@ def test_a_turn_that_stays_open_is_refused_in_degrees(row: int) -> None:
     covariance[row, row] = 0.305**2
     with pytest.raises(GeometryError, match=r"\(17 degrees, 1 stddev\): survey a point off that line"):
         refuse_open_turn(covariance)
+
+
+@pytest.mark.parametrize("is_mark", [[True] * 8, [False] * 30])
+def test_exchanged_axes_are_named(is_mark: list[bool]) -> None:
+    positions = survey(is_mark, noise_m=0.02)
+    assert not [*_doubts_of_axes(positions)]
+    exchanged = replace(positions, position_m=positions.position_m[:, [1, 0, 2]])
+    (doubt,) = _doubts_of_axes(exchanged)
+    assert doubt.reason.endswith("two axes are exchanged, or heights count downwards")
+
+
+def test_the_mirror_image_of_positions_in_a_plane_is_not_named() -> None:
+    positions = survey([True] * 8)
+    flat = replace(positions, places=positions.places * [1, 1, 0])
+    moved = flat.predicted_m(SITE_FROM_MODEL) + 0.02 * np.random.default_rng(1).standard_normal((8, 3))
+    assert not [*_doubts_of_axes(replace(flat, position_m=moved))]

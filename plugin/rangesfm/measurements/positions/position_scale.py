@@ -51,6 +51,8 @@ from rangesfm.util.processes.threads import with_one_blas_thread
 _MAX_NUM_TRIPLES = 300
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
 _MAX_TURN_STDDEV = 0.3
+# Positions are mirrored if the mirror image of the map fits them this many times as well.
+_MIRRORED = 3.0
 
 
 @dataclass(frozen=True)
@@ -179,8 +181,30 @@ class PositionScale(KindOnMap):
         return np.asarray(self.takes_part & (self.known.is_mark | (self.fit.weights >= OUTLIER_BELOW)))
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
-        """Yield that nothing tells which of three positions is wrong, and why the interval is wide."""
-        return doubts_of_positions(int(self.used.sum()), uncertainty, has_check=bool(self.known.is_check.any()))
+        """Yield that the positions are mirrored, that three of them check nothing, and why the interval is wide."""
+        yield from _doubts_of_axes(self.known)
+        yield from doubts_of_positions(int(self.used.sum()), uncertainty, has_check=bool(self.known.is_check.any()))
+
+
+def _doubts_of_axes(known: KnownPositions) -> Iterator[Doubt]:
+    """Yield that the positions are those of a mirror image, as with two axes exchanged."""
+    places, targets = known.places[~known.is_check], known.position_m[~known.is_check]
+    freedom = 3 * len(places) - 7
+    if freedom <= 0:
+        return
+    here_m, mirrored_m = (_rms_m(places, targets * signs) for signs in ([1, 1, 1], [1, 1, -1]))
+    # Chance makes either of two fits of so few positions the better one; errors that last make it so in a flat site.
+    by_chance = float(special.fdtri(freedom, freedom, 1 - FALSE_ALARM_RATE))
+    if here_m > max(np.sqrt(by_chance), _MIRRORED) * mirrored_m:
+        reason = (
+            f"the known positions fit a mirror image of the map to {mirrored_m:.2g} m, and the map itself to "
+            f"{here_m:.2g} m: two axes are exchanged, or heights count downwards"
+        )
+        yield Doubt(reason, "give the positions with x to the east, y to the north and heights upwards")
+
+
+def _rms_m(places: Array, targets: Array) -> float:
+    return rms(align_points(places, targets).apply(places) - targets)
 
 
 def doubts_of_positions(num_used: int, uncertainty: ScaleUncertainty, *, has_check: bool) -> Iterator[Doubt]:
