@@ -49,7 +49,7 @@ def test_what_control_points_give_is_what_a_run_states_of_them() -> None:
     for seed in range(8):
         off_m = STDDEV_M * np.random.default_rng(seed).standard_normal(known.position_m.shape)
         found = scale_by_positions(replace(known, position_m=known.position_m + off_m), plan.trajectory, bending)
-        stated.append(found.alone.uncertainty.empirical)
+        stated.append(found.alone.posterior.uncertainty.empirical)
     assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.35)
 
 

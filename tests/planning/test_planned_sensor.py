@@ -42,7 +42,7 @@ def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion
     on_map = PlannedSensor().on_map(true, WalkBending(in_first_camera(true)))
     sizes = {name: stated.problem.sizes[name] for name in on_map.sizes}
     alike = replace(replace(on_map, sizes=sizes).alone.problem, sizes=stated.problem.sizes)
-    assert alike.posterior().uncertainty.empirical == pytest.approx(stated.uncertainty.empirical, rel=0.15)
+    assert alike.posterior().uncertainty.empirical == pytest.approx(stated.posterior.uncertainty.empirical, rel=0.15)
 
 
 def test_a_level_camera_leaves_scale_factors_open_and_tilting_it_gains_what_the_plan_promises(tmp_path: Path) -> None:

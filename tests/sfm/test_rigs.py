@@ -167,7 +167,7 @@ def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_anoth
     found = known_scale(lengths_between_points(located, path, WalkBending(in_first_camera(path)))).alone
     assert found.scale.value == pytest.approx(1.0, rel=1e-3)
     expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)
-    assert found.uncertainty.empirical == pytest.approx(expected, rel=1e-3)
+    assert found.posterior.uncertainty.empirical == pytest.approx(expected, rel=1e-3)
 
 
 def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(

@@ -96,7 +96,7 @@ def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
         return Found(np.nan, np.nan, np.inf, str(error))
     known = found.alone
     true = align_points(path.centers, motion.places_m(path.timestamps_s)).scale
-    off = float(np.log(known.scale.value / true)) / known.uncertainty.empirical
+    off = float(np.log(known.scale.value / true)) / known.posterior.uncertainty.empirical
     upward = Rotation.from_rotvec([0.3, -1.0, 2.0]).apply([0.0, 0.0, 1.0])  # as ``photos`` turned the world
     away = found.upward.up_in_first_camera - path.world_from_cam[0].T @ upward
     doubts = told_by(found)
@@ -104,14 +104,14 @@ def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
     turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
     path = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
     planned = PlannedSensor(grade=of_grade).on_map(path, WalkBending(in_first_camera(path))).alone  # type: ignore[arg-type]
-    widths = known.uncertainty.half_width_95, planned.uncertainty.half_width_95
+    widths = known.posterior.uncertainty.half_width_95, planned.posterior.uncertainty.half_width_95
     return Found(off, tilt, widths[0], "; ".join([told, *doubts]), widths[1])
 
 
 def told_by(found: InertialScale) -> list[str]:
     """Return what the verdict says of a map by the sensor alone."""
     known = found.alone
-    return [*(doubt.reason for doubt in found.doubts(known.uncertainty)), *found.tests(known, {}).reasons]
+    return [*(doubt.reason for doubt in found.doubts(known.posterior.uncertainty)), *found.tests(known, {}).reasons]
 
 
 class Mistake(NamedTuple):

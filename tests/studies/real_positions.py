@@ -96,7 +96,7 @@ def main() -> int:
         log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), at_s, None, np.arange(len(at_s)))
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
         found = scale_by_positions(locate_antenna(find_antenna_offset(track, path), path), path, bending)
-        told("scaled", found.alone.scale.value, found.alone.uncertainty)
+        told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)
         if seed < asked.num_refined:
             told("refined", *refined(whole, track))
     bound = NOISE_M / np.linalg.norm(at_m - at_m.mean(axis=0))

@@ -286,11 +286,6 @@ class JointMap:
         """Metres per unit of the unscaled model, at the estimate."""
         return self.posterior.uncertainty.about(self.estimate.scale * self.metres_per_unit)
 
-    @property
-    def uncertainty(self) -> ScaleUncertainty:
-        """Uncertainty of the scale."""
-        return self.posterior.uncertainty
-
     def columns(self, kind: str, of_kind: Array) -> Array:
         """Return the columns (c, m) of the problem by those (k, m) of the observations of one kind."""
         columns = np.zeros((len(self.problem.is_used), of_kind.shape[1]))
@@ -322,10 +317,6 @@ class JointMap:
     def concluded(self) -> JointMap:
         """Return the map with what it says of each kind."""
         return replace(self, kinds=tuple(kind.concluded(self) for kind in self.kinds))
-
-    def moved(self, bent: FrameSteps = NO_STEPS) -> tuple[KindOnMap, ...]:
-        """Return the kinds on the map that was bent by steps of its frames, and moved to its estimate."""
-        return tuple(kind.moved(self.posterior, bent) for kind in self.kinds)
 
 
 def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second: ScaleByKind) -> MistakeTest:

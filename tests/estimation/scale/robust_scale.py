@@ -11,4 +11,4 @@ from rangesfm.util.geometry.similarity import Similarity
 def metric_from_sfm_by_robust_weights(estimate: ScaleEstimate) -> Similarity:
     ranges = find_kind(estimate.kinds, RangeScale)
     assert ranges is not None
-    return ranges.placed
+    return ranges.start

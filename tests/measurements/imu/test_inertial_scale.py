@@ -42,8 +42,8 @@ def test_a_log_gives_metres_whatever_the_scale_errors_of_its_axes() -> None:
         scale_errors = np.random.default_rng(seed).normal(0, 0.03, 3)
         found = located(by_hand(seed, axes=(3.0, 3.0, 3.0)), scale_errors, seed=seed).alone
         off = np.log(found.scale.value / METRES_PER_UNIT)
-        assert found.uncertainty.half_width_95 < 0.03
-        errors.append(off / found.uncertainty.empirical)
+        assert found.posterior.uncertainty.half_width_95 < 0.03
+        errors.append(off / found.posterior.uncertainty.empirical)
     assert np.abs(errors).max() < 3
     assert np.sqrt(np.mean(np.square(errors))) < 2
 
@@ -51,8 +51,8 @@ def test_a_log_gives_metres_whatever_the_scale_errors_of_its_axes() -> None:
 def test_the_interval_of_a_rover_that_hardly_turns_or_accelerates_is_wide() -> None:
     hand = by_hand(0, axes=(0.0, 0.0, 1.0))
     slow = replace(hand, frequencies_hz=hand.frequencies_hz / 10, amplitudes_rad=hand.amplitudes_rad / 10)
-    [doubt] = (kind := located(slow, np.zeros(3))).doubts(kind.alone.uncertainty)
-    assert kind.alone.uncertainty.half_width_95 > 0.04
+    [doubt] = (kind := located(slow, np.zeros(3))).doubts(kind.alone.posterior.uncertainty)
+    assert kind.alone.posterior.uncertainty.half_width_95 > 0.04
     assert "moved too evenly" in doubt.reason
 
 

@@ -99,7 +99,7 @@ def test_the_interval_holds_the_truth_and_honest_lengths_stay(median: float) -> 
         path = walked(rng)
         shaken = median * float(np.exp(0.8 * rng.standard_normal()))
         found = scaled(located(path, 3, rng, shaken), path, bending=Shaken(path, median))
-        off.append(np.log(found.alone.scale.value / SCALE) / found.alone.uncertainty.empirical)
+        off.append(np.log(found.alone.scale.value / SCALE) / found.alone.posterior.uncertainty.empirical)
         num_left_out += int(np.count_nonzero(~found.is_kept))
     assert np.mean(np.abs(off) < 1.96) >= 0.9
     assert num_left_out <= 4
@@ -145,7 +145,7 @@ def test_of_two_that_contradict_each_other_none_is_left_out_and_the_interval_say
     honest = located(path, 2, rng)
     found = scaled(replace(honest, distance_m=honest.distance_m * [1.0, 1.2]), path)
     assert found.is_kept.all()
-    assert found.alone.uncertainty.empirical > 0.03
+    assert found.alone.posterior.uncertainty.empirical > 0.03
 
 
 def test_printed_sides_are_wrong_together(rng: np.random.Generator) -> None:
@@ -155,8 +155,8 @@ def test_printed_sides_are_wrong_together(rng: np.random.Generator) -> None:
     true_m = SCALE * sides.model_length
     sides = replace(sides, distance_m=true_m, stddev_m=0.01 * true_m)
     together = scaled(sides, path)
-    assert together.alone.uncertainty.components["tape"] == pytest.approx(0.01, rel=0.05)
-    assert alone.alone.uncertainty.components["tape"] < 0.6 * TAPE_M / (1.0 * np.sqrt(4))
+    assert together.alone.posterior.uncertainty.components["tape"] == pytest.approx(0.01, rel=0.05)
+    assert alone.alone.posterior.uncertainty.components["tape"] < 0.6 * TAPE_M / (1.0 * np.sqrt(4))
 
 
 def test_checks_have_no_say_and_two_ends_in_one_place_none_at_all(rng: np.random.Generator) -> None:
@@ -175,7 +175,7 @@ def test_without_bending_lengths_weigh_by_tape_and_marks(rng: np.random.Generato
     found = scaled(replace(taped, mark_stddev=mark_stddev), path)
     own = 0.005**2 + (mark_stddev * found.alone.scale.value) ** 2
     assert found.alone.scale.value == pytest.approx(np.average([0.5, 0.51], weights=1 / own), rel=1e-5)
-    stddevs = found.alone.uncertainty.components
+    stddevs = found.alone.posterior.uncertainty.components
     assert np.hypot(stddevs["tape"], stddevs["marks"]) == pytest.approx(1 / np.sqrt(np.sum(2.0**2 / own)), rel=0.02)
 
 

@@ -13,7 +13,7 @@ from tests.studies.drifting_maps import lap_of_drift
 
 from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
-from rangesfm.measurements.ranges.mistakes.linearized import ranges_on_map
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.pipeline.metric_result import MetricResult
 
@@ -41,9 +41,13 @@ def test_an_anchor_that_drift_puts_on_the_wrong_side_is_brought_to_the_right_one
     assert crossed.estimate.verdict == "good", crossed.estimate.reasons
 
 
+def on_moved_map(metric: MetricResult) -> RangesOnMap:
+    at_rest = metric.all_measured
+    return known(find_kind(at_rest.kinds, RangeScale)).moved(at_rest.posterior).on(at_rest)
+
+
 def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:
-    at = known(find_kind(known(crossed.at_refined).moved(), RangeScale))
-    sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
+    sides = likelier_sides(on_moved_map(crossed))
     assert not sides.has_crossed
     assert sides.mirrors_m == {"A1": None}
     assert sides.applied_to(crossed.anchors) == crossed.anchors
@@ -61,8 +65,7 @@ def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:
 
 
 def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
-    at = known(find_kind(known(crossed.at_refined).moved(), RangeScale))
-    on_map = ranges_on_map(at.posed, at.solution, at.bending)
+    on_map = on_moved_map(crossed)
     surveyed_m = replace(on_map.problem, anchor_mean_m=on_map.state.anchors_m, anchor_stddev_m=np.array([0.02]))
     assert likelier_sides(replace(on_map, problem=surveyed_m)).mirrors_m == {}
 

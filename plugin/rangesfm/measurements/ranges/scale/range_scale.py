@@ -78,16 +78,6 @@ class RangeScale(KindOnMap):
         return binned_ranges(self.posed, self.solution, max_num)
 
     @property
-    def metric_from_model(self) -> Similarity:
-        """From the frame of the first camera of the problem's path to the metric world."""
-        return self.solution.fit.state.metric_from_model
-
-    @property
-    def placed(self) -> Similarity:
-        """From the world of the path to the metric world."""
-        return self.metric_from_model @ replace(IDENTITY, scale=self.unit) @ first_camera_from(self.path)
-
-    @property
     def predicted_m(self) -> Array:
         """The (k,) predicted ranges."""
         return predicted_ranges(self.solution.problem, self.solution.fit.state)
@@ -95,13 +85,14 @@ class RangeScale(KindOnMap):
     @property
     def start(self) -> Similarity:
         """The placement of the solution."""
-        return self.placed
+        placed = self.solution.fit.state.metric_from_model
+        return placed @ replace(IDENTITY, scale=self.unit) @ first_camera_from(self.path)
 
     @cached_property
     def alone(self) -> JointMap:
         """The map by the ranges alone, solved again from here."""
         own = self._without_others
-        return join_kinds((own,), self.path, own.placed, self.bending)
+        return join_kinds((own,), self.path, own.start, self.bending)
 
     @cached_property
     def _without_others(self) -> RangeScale:
@@ -252,7 +243,7 @@ class RangeScale(KindOnMap):
             posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
             unknown = replace(self, posed=posed, solution=solution)
             others = [unknown if each is self else each for each in on_map.kinds]
-            unplaced = on_map.rejoined(others, unknown.placed).posterior.uncertainty
+            unplaced = on_map.rejoined(others, unknown.start).posterior.uncertainty
             yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
 
 
