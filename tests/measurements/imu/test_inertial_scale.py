@@ -75,7 +75,7 @@ def test_axes_that_are_not_at_right_angles_neither_tilt_the_map_nor_hide_its_sca
     right, wrong = (
         scale_by_sensor(replace(problem, log=each), WalkBending(problem.path)) for each in (problem.log, log)
     )
-    assert wrong.alone.posterior.uncertainty.half_width_95 < 1.2 * right.alone.uncertainty.half_width_95
+    assert wrong.alone.posterior.uncertainty.half_width_95 < 1.2 * right.alone.posterior.uncertainty.half_width_95
     assert wrong.alone.scale.value == pytest.approx(right.alone.scale.value, rel=0.002)
     apart = np.linalg.norm(wrong.upward.up_in_first_camera - right.upward.up_in_first_camera)
     assert apart < right.upward.stddev_rad
