@@ -51,8 +51,10 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
     used, imu = () if ranges is None else np.array(ranges.anchor_id, dtype=str)[ranges.is_used], folder.summary.imu
-    if model is None or (not len(used) and imu is None):
-        raise InputError("has no metric model or no used ranges, expected a finished result", path)
+    if model is None:
+        raise InputError("has no metric model, expected a finished result", path)
+    if not len(used) and imu is None:
+        raise InputError("was made without ranges, expected a result with some: a plan takes the radio from them", path)
     trajectory = path_in_result(model, folder)
     if not is_one_after_the_other(trajectory):
         expected = "expected the result of one survey"

@@ -266,12 +266,12 @@ def test_degrees_of_photos_are_read_as_programs_write_them(
     "names",
     [
         "Label,X/Easting,Y/Northing,Z/Altitude,X_est,Y_est,Z_est",
-        "Name,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height",
+        "File Name,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height",
         "Name,Easting,Northing,Elevation,Base easting,Base northing,Base elevation",
     ],
 )
 def test_of_several_coordinates_the_measured_ones_in_the_map_are_taken(names: str, tmp_path: Path) -> None:
-    found = read(tmp_path, f"{names}\na.jpg,1,2,3,8,49,6\nb.jpg,4,5,6,8,49,6\n")
+    found = read(tmp_path, f"{names}\nIMG_1,1,2,3,8,49,6\nIMG_2,4,5,6,8,49,6\n")
     np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
     assert found.crs is None
 

@@ -67,7 +67,7 @@ def is_degrees(name: str, axis: str) -> bool:
 
 def _labels(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
     """Return the column that names the photos as photogrammetric programs label cameras."""
-    wanted = terms.POINT | terms.ID | {"camera", "cam"}
+    wanted = terms.POINT | terms.ID | terms.FILE | {"camera", "cam"}
     return [
         column
         for column in columns
