@@ -41,7 +41,7 @@ _RICHER = {
 _ORIGIN = {"fx": "f", "fy": "f", "k1": "k"}
 _MAX_NUM_ITERATIONS = 30
 # Relative decrease of the cost at which an adjustment ends.
-_FUNCTION_TOLERANCE = 1e-4
+_FUNCTION_TOLERANCE = 1e-3
 # Trust region with which a free lens begins. Parameters of a rational distortion can hardly be told apart, so that
 # free steps fail; a chain of 600 photos still bends as it does in them.
 _TRUST_REGION_RADIUS = 1e6
@@ -82,19 +82,23 @@ class LensFit:
         return bool(self.gain < bending_factor**2 * special.chdtri(self.num_params, RISK))
 
 
-def fit_lens(model: pycolmap.Reconstruction) -> LensFit | None:
-    """Return the fit with richer cameras; None where the points are too few to tell, or the solver fails.
+def fit_lens(model: pycolmap.Reconstruction, least_change: float = 0.0) -> LensFit | None:
+    """Return the fit with richer cameras; None where it would say nothing.
+
+    That is where lengths in the map hardly change with them, where the points are too few to tell, or the solver fails.
 
     Args:
         model: with points; it is not changed.
+        least_change: relative change of lengths that matters.
     """
-    own = pycolmap.Reconstruction(model)
+    own, richer = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    for camera in richer.cameras.values():
+        _enrich(camera)
     try:
-        before = _adjust(own, lens_is_free=False)
-        richer = pycolmap.Reconstruction(own)
-        for camera in richer.cameras.values():
-            _enrich(camera)
         after = _adjust(richer, lens_is_free=True)
+        if _change_of_lengths(model, richer) <= least_change:
+            return None
+        before = _adjust(own, lens_is_free=False)
     except SolverError:
         return None
     num_params = sum(len(camera.params) for camera in richer.cameras.values())

@@ -28,6 +28,7 @@ from rangesfm.pipeline.refine_map import metres_per_unit_of
 from rangesfm.solver.bending import FrameSteps
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.util.geometry.poses import model_poses
 
 
@@ -77,7 +78,8 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     estimate, refinement = metric.estimate, metric.kept_refinement
     is_learnt = any(each.shows_bending for each in metric.kinds)
     factor = refinement.bending_factor if refinement is not None and is_learnt else None
-    doubt = doubt_of_lens(fit_lens(metric.final), factor, estimate.uncertainty.half_width_95)
+    half_width_95 = estimate.uncertainty.half_width_95
+    doubt = doubt_of_lens(fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE)), factor, half_width_95)
     return () if doubt is None else (doubt,)
 
 
