@@ -174,14 +174,14 @@ def test_the_map_before_is_the_one_that_open_loops_would_give(closed: ClosedLaps
 def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedLaps) -> None:
     num_done, num_all = closed.counts[0]
     assert num_done == num_all
-    assert num_done > 100
+    assert num_done > 50
 
 
 def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: Path) -> None:
     changes = {"output.path": tmp_path / "out", "report.reference": None, "scale.max_relative_stddev": 10.0}
     listener, survey = Listener(), laps.survey.changed(changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopFinder, "propose", lambda *_, **__: [])
+        patch.setattr(LoopFinder, "propose", lambda *_, **__: {})
         loops = refine_model(survey, progress=listener).summary.loops
     assert listener.stages.count("refinement") == 1
     assert loops is not None

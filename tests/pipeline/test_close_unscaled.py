@@ -115,8 +115,8 @@ def test_photos_that_look_alike_close_loops_that_a_map_does_not_predict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Reconstructed.of(around_a_room(), tmp_path / "out")
-    monkeypatch.setattr(LoopFinder, "propose", lambda *_, **__: [])
-    monkeypatch.setattr(Views, "overlaps", lambda *given: 0.0 * given[2])
+    monkeypatch.setattr(LoopFinder, "propose", lambda *_, **__: {})
+    monkeypatch.setattr(Views, "overlaps", lambda *given, **_: 0.0 * given[2])
     open_m = made.error_m(made.model)
     assert made.error_m(made.close()) < 0.6 * open_m
 

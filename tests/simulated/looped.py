@@ -254,7 +254,7 @@ class SimulatedMap:
     def matches_of(self, pairs: Iterable[Pair]) -> dict[Pair, Matches]:
         return {pair: self.matches[pair] for pair in pairs if pair in self.matches}
 
-    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> SimulatedMap:
+    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> SimulatedMap | None:
         path = self.database_path
         path.unlink(missing_ok=True)
         write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
@@ -267,7 +267,7 @@ class SimulatedMap:
             self.finder.relative_poses(loops),
             lambda model: merge_tracks(model, path, seed=0),
         )
-        return replace(self, at_rest=rest)
+        return None if rest is None else replace(self, at_rest=rest)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from rangesfm.estimation.vision_information import (
 )
 from rangesfm.measurements.kind import Block, MapState
 from rangesfm.solver.bending import FrameSteps
+from rangesfm.solver.bundle_adjustment import farthest
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.util.geometry.poses import Poses, model_poses
 from rangesfm.util.geometry.robust_statistics import wider
@@ -39,6 +40,8 @@ SAME_NOISE = 0.05
 # Movement of a keyframe, in standard deviations of a measurement, at which the solver stops. A turn of the whole world
 # by centimetres costs the full problem tens of iterations, since all points have to follow; here it costs one step.
 _TOLERANCE = 0.001
+# Movement of a keyframe, in standard deviations of a feature, above which photos show that loops were open.
+_NUM_VISIBLE_STDDEVS = 3.0
 # With many more steps, points follow a camera that is out of its place, which then stays there.
 _NUM_TRIANGULATIONS = 5
 
@@ -92,13 +95,11 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
     return _moved(problem, rays, graph, _solve_precisely(graph, problem, graph.start))
 
 
-def close_in_graph(
-    problem: MapProblem, known: MapProblem, rays: Observations, loops: LoopPoses
-) -> tuple[Straightened, bool]:
-    """Close loops of a model that was refined, in place, and return the result and whether the model stays near.
+def close_in_graph(problem: MapProblem, known: MapProblem, rays: Observations, loops: LoopPoses) -> Straightened | None:
+    """Close loops of a model that was refined, in place; None where that bends it by no more than photos just see.
 
-    A map that bends far leaves its ranges on the way, and would lose them as outliers. So known noise is kept only
-    where closing bends the map by no more than photos just see. Elsewhere it is estimated as in ``straighten``.
+    A map that bends leaves its ranges on the way, and would lose them as outliers. So their noise is estimated anew, as
+    in ``straighten``.
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
@@ -106,11 +107,12 @@ def close_in_graph(
     """
     graph = _graph(known, rays, known.start.blocks, loops)
     fit = _solve_precisely(graph, known, graph.start)
-    is_near = _bend(graph.vision.origin.centers, fit.state.poses.centers) <= problem.visible_m
-    if is_near or not problem.kinds:
-        return _moved(known, rays, graph, fit), is_near
-    fit, problem = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)
-    return _moved(problem, rays, graph, fit), False
+    before, after = graph.vision.origin.centers, fit.state.poses.centers
+    if farthest(align_points(before, after).apply(before), after) <= _NUM_VISIBLE_STDDEVS * problem.visible_m:
+        return None
+    if problem.kinds:
+        fit, problem = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)
+    return _moved(problem, rays, graph, fit)
 
 
 def _moved(problem: MapProblem, rays: Observations, graph: KeyframeGraph, fit: GraphSolution) -> Straightened:

@@ -95,22 +95,20 @@ class MapAtRest:
         return self.solutions[-1].converged and self.is_still
 
 
-def refine(problem: MapProblem, markers: Mapping[str, Marker], closed: Straightened | None = None) -> MapAtRest:
+def refine(problem: MapProblem, markers: Mapping[str, Marker]) -> MapAtRest:
     """Refine a model in place, and return it at rest.
 
     Misplaced points (see ``misplaced_points``), as wrong matches make them, do not take part.
 
     Args:
         markers: that the measurements refer to, by name.
-        closed: the map straightened before, as by closing its loops; None: it is straightened here.
 
     Raises:
         SolverError: the solver failed. InputError: an option passed through to COLMAP is unknown.
     """
     with _marks_in_map(problem, markers) as marked:
         marked, adjustment, rays = _without_misplaced(marked, markers)
-        start = straighten(marked, rays) if closed is None else replace(closed, problem=marked.like(closed.problem))
-        return _adjusted(adjustment, start)
+        return _adjusted(adjustment, straighten(marked, rays))
 
 
 @contextmanager
@@ -142,8 +140,8 @@ def refine_with_loops(
     markers: Mapping[str, Marker],
     loops: LoopPoses,
     merge_tracks: Callable[[pycolmap.Reconstruction], None],
-) -> MapAtRest:
-    """Move a refined model so that its loops close, in place, and refine it again.
+) -> MapAtRest | None:
+    """Move a refined model so that its loops close, in place, and refine it again; None where they are closed already.
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
@@ -158,16 +156,15 @@ def refine_with_loops(
     )
     seen, _, rays = _without_misplaced(problem, {})
     at_indices = replace(loops, reference=reference, frame=frame)
-    closed, is_near = close_in_graph(seen, seen.like(known), rays, at_indices)
+    if (closed := close_in_graph(seen, seen.like(known), rays, at_indices)) is None:
+        return None
     merge_tracks(problem.metric)
-    if is_near:
-        return refine(problem, markers, closed)
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
     # so only when those that have merged have straightened it.
     with _marks_in_map(problem, markers) as marked:
         marked, adjustment, _ = _without_misplaced(marked, markers)
         added = marked.add_to(adjustment, closed.blocks)
-        solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * marked.smallest_stddev)
+        solve_bundle_adjustment(adjustment, marked.visible_m)
         blocks = added.state(problem.metric, problem.frame_ids).blocks
     merge_tracks(problem.metric)
     return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)), markers)

@@ -29,8 +29,8 @@ class RefinedMap:
     at_rest: MapAtRest
 
 
-Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap]
-"""Closes loops of a map and refines it again."""
+Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap | None]
+"""Closes loops of a map and refines it again; None if they are closed in it."""
 
 
 def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -> MetricResult:
@@ -91,8 +91,9 @@ class _MetricMap:
     def why_broken(self) -> tuple[str, ...]:
         return self.refined.metric.why_broken
 
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _MetricMap:
-        return replace(self, refined=self.refine(self.run, self.refined, loops, merge))
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _MetricMap | None:
+        closed = self.refine(self.run, self.refined, loops, merge)
+        return None if closed is None else replace(self, refined=closed)
 
 
 def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: TriedPairs) -> MetricResult:

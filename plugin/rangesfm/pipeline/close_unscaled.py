@@ -114,10 +114,10 @@ class _UnscaledMap:
         errors = point_errors(self.model)
         return () if errors.fit else (errors.apart("the refined map"),)
 
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _UnscaledMap:
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _UnscaledMap | None:
         problem = _problem(self.survey, self.trajectory, self.model, is_refined=True)
         rest = refine_with_loops(problem, problem, {}, loops, merge)
-        return _UnscaledMap(self.survey, self.trajectory, rest)
+        return None if rest is None else _UnscaledMap(self.survey, self.trajectory, rest)
 
 
 def _problem(survey: Survey, path: Trajectory, model: pycolmap.Reconstruction, *, is_refined: bool) -> MapProblem:

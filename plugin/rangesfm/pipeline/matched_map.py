@@ -16,7 +16,7 @@ from rangesfm.sfm.loop_database import LoopMatching, Pair
 from rangesfm.sfm.loops.loop_finder import LoopFinder
 from rangesfm.sfm.loops.merge import merge_tracks
 from rangesfm.sfm.loops.resection import Loop
-from rangesfm.sfm.loops.rounds import MAX_NUM_PAIRS, TriedPairs, find_in
+from rangesfm.sfm.loops.rounds import TriedPairs, find_in
 from rangesfm.sfm.photos_alike import pairs_alike
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -51,8 +51,8 @@ class ClosableMap(Protocol):
     @property
     def why_broken(self) -> Sequence[str]: ...
 
-    def with_loops(self: _Map, loops: LoopPoses, merge: MergeTracks) -> _Map:
-        """Return the map refined with loops, which are relative poses by ids of frames."""
+    def with_loops(self: _Map, loops: LoopPoses, merge: MergeTracks) -> _Map | None:
+        """Return the map refined with loops, relative poses by ids of frames; None if they are closed in it."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ class MatchedMap(Generic[_Map]):
 
         with self.journal.stage("refinement"):
             closed = self.map.with_loops(finder.relative_poses(loops), merge)
-        if why := closed.why_broken:
+        if closed is not None and (why := closed.why_broken):
             self.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
             return None
-        return replace(self, map=closed)
+        return None if closed is None else replace(self, map=closed)
 
     def keep(self, tried: TriedPairs) -> None:
         """Keep the matches of closed loops alone in the database, and what was tried in vain."""
@@ -103,7 +103,7 @@ class MatchedMap(Generic[_Map]):
     def _alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
         if not self.asks_vocabulary:
             return []
-        return pairs_alike(self.matching.database, known, self.matching.log, max_num=MAX_NUM_PAIRS, seed=self.seed)
+        return pairs_alike(self.matching.database, known, self.matching.log, max_num=1, seed=self.seed)
 
     @cached_property
     def _finder(self) -> LoopFinder | None:

@@ -47,8 +47,8 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
 
 def refine_closed_map(
     run: SurveyRun, refined: RefinedMap, loops: LoopPoses, merge_tracks: Callable[[pycolmap.Reconstruction], None]
-) -> RefinedMap:
-    """Close the loops of a refined map, and refine it again.
+) -> RefinedMap | None:
+    """Close the loops of a refined map, and refine it again; None if they are closed in it.
 
     Args:
         loops: measured relative poses, by ids of frames. merge_tracks: makes one of points that two passes saw apart,
@@ -63,7 +63,7 @@ def refine_closed_map(
         problem = _problem(run, metric, measured, metric.final, is_refined=True)
         known = problem.like(refined.at_rest.problem)
         rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
-        return _finished(run, metric, measured, rest)
+        return None if rest is None else _finished(run, metric, measured, rest)
 
 
 def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:

@@ -74,13 +74,14 @@ class Views:
         """Return the (n, 3) middles of what the photos see."""
         return np.asarray(np.median(self.points, axis=1))
 
-    def overlaps(self, first: int, others: Indices, margin_m: Array) -> Array:
+    def overlaps(self, first: int, others: Indices, margin_m: Array, *, from_anywhere: bool) -> Array:
         """Return the (k,) shares of the points of one photo that can be found again in k others.
 
         Lenses without distortion do for this.
 
         Args:
             margin_m: (k,) by how much the other photos may be out of place.
+            from_anywhere: whether to count points that are seen from another direction or distance, too.
         """
         from_first = self.points[first] - self.centers[first]
         from_others = self.points[first] - self.centers[others, None]
@@ -93,7 +94,7 @@ class Views:
         focal, middle, size = (of[others, None] for of in (self.focal_px, self.middle_px, self.size_px))
         pixel, margin = focal * in_cam[..., :2] / depth + middle, focal * margin_m[:, None, None] / depth
         is_inside = np.all((pixel > -margin) & (pixel < size + margin), axis=-1) & (in_cam[..., 2] > 0)
-        return np.asarray(np.mean(is_alike & is_inside, axis=1))
+        return np.asarray(np.mean((is_alike | from_anywhere) & is_inside, axis=1))
 
 
 def _some_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array:
@@ -104,35 +105,35 @@ def _some_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array
 
 def propose_pairs(
     views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]], *, max_num: int, pixel_stddev: float
-) -> list[tuple[int, int]]:
-    """Return the pairs of photos that tell most about the map, as ids, smaller first.
+) -> dict[int, list[tuple[int, int]]]:
+    """Return for each photo, by its id, its pairs that tell most about the map, the best first, as ids, smaller first.
 
+    A pair tells what each of its features does: the logarithm of the error of the prediction over that of the feature.
     Of photos that know each other only one is paired with the same photo, since they tell the same. Where the map is
     already known to the precision of a feature, no pair is worth its time.
 
     Args:
         errors: of the keyframes of ``views``.
         known: ids of the photos that each photo has been matched with or shares points with, by its id.
-        max_num: largest number of pairs that one photo proposes.
+        max_num: largest number of pairs of one photo.
         pixel_stddev: standard deviation of a coordinate of a feature.
     """
-    pairs: set[tuple[int, int]] = set()
+    choices: dict[int, list[tuple[int, int]]] = {}
     for first, others, overlap in predicted_overlaps(views, errors, known):
-        unknown_px = _unknown_px(views, errors, first, others)
-        worth = np.where(unknown_px > pixel_stddev, overlap * unknown_px, 0.0)
-        for second in _best_apart(others, worth, views.image_ids, known, max_num):
-            ids = sorted((int(views.image_ids[first]), int(views.image_ids[second])))
-            pairs.add((ids[0], ids[1]))
-    return sorted(pairs)
+        worth = overlap * np.log(np.maximum(_unknown_px(views, errors, first, others) / pixel_stddev, 1.0))
+        id_ = int(views.image_ids[first])
+        best = views.image_ids[_best_apart(others, worth, views.image_ids, known, max_num)].tolist()
+        choices[id_] = [(min(id_, other), max(id_, other)) for other in best]
+    return choices
 
 
 def predicted_overlaps(
-    views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]]
+    views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]], *, from_anywhere: bool = False
 ) -> Iterator[tuple[int, Indices, Array]]:
     """Yield for each photo the others that the map predicts to see enough of its points, with their shares.
 
     Args:
-        errors, known: as for ``propose_pairs``.
+        errors, known: as for ``propose_pairs``. from_anywhere: as for ``Views.overlaps``.
 
     Yields:
         The row of a photo in ``views``, the rows (k,) of the others, and the (k,) shares of its points in these.
@@ -144,7 +145,8 @@ def predicted_overlaps(
         others = np.array([k for k in near if k != first and int(views.image_ids[k]) not in knows], dtype=np.int64)
         if not len(others):
             continue
-        overlap = views.overlaps(first, others, np.hypot(stddev_m[first], stddev_m[others]))
+        margin_m = np.hypot(stddev_m[first], stddev_m[others])
+        overlap = views.overlaps(first, others, margin_m, from_anywhere=from_anywhere)
         yield first, others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
 
 

@@ -55,20 +55,23 @@ class LoopFinder:
     def views(self) -> Views:
         return Views.in_model(self.model, self.path.frame_ids)
 
-    def propose(self, matched: Mapping[int, Set[int]], *, max_num: int) -> list[Pair]:
-        """Return the pairs that are worth matching.
+    def propose(self, matched: Mapping[int, Set[int]], *, max_num: int) -> dict[int, list[Pair]]:
+        """Return for each photo, by its id, the pairs that are worth matching, the best first.
 
         Args:
             matched: ids of the photos that each photo was matched with, by its id.
-            max_num: largest number of pairs that one photo proposes.
+            max_num: largest number of pairs of one photo.
         """
         known = self._known(matched)
         return propose_pairs(self.views, self.errors, known, max_num=max_num, pixel_stddev=self.pixel_stddev)
 
     def predicted(self, matched: Mapping[int, Set[int]]) -> dict[int, set[int]]:
-        """Return for each photo those that it was matched with, or that the map predicts to see the same, by ids."""
+        """Return for each photo those that it was matched with, or that the map predicts to see the same, by ids.
+
+        They may see it from where its features are not found again.
+        """
         known, ids = self._known(matched), self.views.image_ids
-        for first, others, _ in predicted_overlaps(self.views, self.errors, known):
+        for first, others, _ in predicted_overlaps(self.views, self.errors, known, from_anywhere=True):
             known[int(ids[first])].update(ids[others].tolist())
         return known
 

@@ -12,7 +12,8 @@ from rangesfm.sfm.loops.loop_finder import LoopFinder
 from rangesfm.sfm.loops.resection import Loop
 
 MAX_NUM_PAIRS = 5
-"""Pairs that one photo proposes at most in a round. Sequential matching pairs a photo with 10 neighbours by default."""
+"""Pairs that one photo proposes at most in a round, of which the others are tried where the first does not match.
+Sequential matching pairs a photo with 10 neighbours by default."""
 
 MAX_NUM_ROUNDS = 3
 
@@ -31,6 +32,11 @@ class TriedPairs:
     closed: frozenset[Pair] = frozenset()
     contradicted: frozenset[Pair] = frozenset()
 
+    @property
+    def promise_more(self) -> bool:
+        """Return whether no fewer pairs contradicted the map than were closed: it was bent, or none was tried."""
+        return len(self.contradicted) >= len(self.closed)
+
 
 _Map = TypeVar("_Map", bound="MapWithLoops")
 
@@ -42,7 +48,7 @@ class MapWithLoops(Protocol):
         """Return the loops that are found in this map beside those closed before, as ``find_in``."""
 
     def with_closed(self: _Map, loops: Sequence[Loop], tried: TriedPairs) -> _Map | None:
-        """Return the map refined with loops; None if it broke.
+        """Return the map refined with loops; None if they are closed in it, or if it broke.
 
         Args:
             loops: that were found last. tried: all pairs, these loops among the closed ones.
@@ -53,14 +59,16 @@ def close_in_rounds(refined: _Map) -> tuple[_Map, TriedPairs]:
     """Close the loops of a map, and return the last map with the pairs of all rounds.
 
     The test of a loop takes the errors of the map for small. A map that is bent by metres contradicts true loops until
-    others have straightened it. Only where loops contradict the map, another round tests them again in the next map,
-    which may propose more. It ends where nothing new is found.
+    others have straightened it. So where loops contradict the map, another round tests them again in the next map. If
+    they are few, this only tells which of them still do; otherwise more are proposed and closed. It ends where nothing
+    new is found.
     """
     tried = TriedPairs()
     for _ in range(MAX_NUM_ROUNDS):
+        may_close = tried.promise_more
         loops, tried = refined.find(tried)
         closed = replace(tried, closed=tried.closed.union(loop.image_ids for loop in loops))
-        if not loops or (after := refined.with_closed(loops, closed)) is None:
+        if not (loops and may_close) or (after := refined.with_closed(loops, closed)) is None:
             break
         refined, tried = after, closed
         if not tried.contradicted:
@@ -83,16 +91,27 @@ def find_in(
         known: ids of the photos that each photo was matched with by the mapping, by its id.
         tried: pairs of the rounds before. Those that the map contradicted are tried again.
         alike: returns pairs of photos that look alike, given for each photo, by its id, those that it is not to be
-            paired with: they were matched with it, or the map predicts that they see the same. It is asked once.
+            paired with: they were matched with it, or the map predicts that they see the same. It is asked once, and of
+            photos that were matched with each other only one is tried.
     """
     matched = {id_: set(others) for id_, others in known.items()}
     for first, second in tried.proposed:
         matched.setdefault(first, set()).add(second)
         matched.setdefault(second, set()).add(first)
-    proposed = set(finder.propose(matched, max_num=MAX_NUM_PAIRS))
+    choices = finder.propose(matched, max_num=MAX_NUM_PAIRS) if tried.promise_more else {}
+    proposed = {pair for of_photo in choices.values() for pair in of_photo[:1]}
+    verified = dict(match(sorted(proposed | tried.contradicted)))
+    tied = {photo for pair in verified for photo in pair}
+    more = {pair for photo, of_photo in choices.items() if photo not in tied for pair in of_photo[1:]}
     if not tried.proposed:
-        proposed.update(alike(finder.predicted(matched)))
-    verified = match(sorted(proposed | tried.contradicted))
+        told = set[int]()  # photos whose neighbours tell the same
+        for first, second in alike(finder.predicted(matched)):
+            if first not in told:
+                more.add((first, second))
+                told.update((first, *known.get(first, ())))
+    if more := more - proposed:
+        verified.update(match(sorted(more)))
+        proposed |= more
     loops, contradicted = finder.tested(verified)
     return loops, TriedPairs(
         tried.proposed.union(proposed),
