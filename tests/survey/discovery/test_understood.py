@@ -203,3 +203,14 @@ def test_the_keyframes_of_a_slam_program_are_the_model_where_there_are_no_photos
     values, notes = understand([tmp_path], {})
     assert "images.model" not in values
     assert any("KeyFrameTrajectory.txt is a trajectory: rangesfm scale" in note for note in notes)
+
+
+def test_ranges_beside_positions_are_no_true_positions(tmp_path: Path) -> None:
+    write_photos(tmp_path / "images", 3)
+    rows = (
+        f'{{"t": {k / 4}, "A1": {3 + k / 9:.3f}, "position": {{"x": 1.5, "y": {k / 8}, "z": 2}}}}' for k in range(40)
+    )
+    (tmp_path / "run.txt").write_text("\n".join(rows))
+    values, notes = understand([tmp_path], {})
+    assert values == {"images.path": tmp_path / "images"}
+    assert any("if it is the radio's log, rangesfm ranges" in note for note in notes)

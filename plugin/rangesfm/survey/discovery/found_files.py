@@ -24,6 +24,7 @@ from rangesfm.measurements.positions.position_formats import is_of_positions
 from rangesfm.measurements.ranges.anchors import anchor_file
 from rangesfm.measurements.ranges.errors.error_curve import is_error_curve_file
 from rangesfm.measurements.ranges.readers import find_log_reader, read_ranges
+from rangesfm.measurements.ranges.readers.guess import guess_columns
 from rangesfm.measurements.ranges.readers.layout import Layout, find_layout
 from rangesfm.measurements.ranges.readers.lists import UnclearListError
 from rangesfm.measurements.ranges.readers.table import TABLE
@@ -261,11 +262,15 @@ def _positions_of(path: Path) -> str | None:
         return None
     on_earth = all(any(is_degrees(column.name, axis) for column in layout.columns) for axis in ("x", "y"))
     try:
-        find_position_columns(path, layout)
+        columns, _ = find_position_columns(path, layout)
     except UnclearListError:
         if on_earth:
             raise
         return None
+    guess = guess_columns(layout)
+    ranges = {} if guess is None else {key: name for key, name in guess.told.items() if key.startswith("range")}
+    if not {*ranges.values()} <= {*columns.values()}:
+        return None  # perhaps a log that has ranges beside the positions
     return POSITIONS if on_earth else _measured_or_true(path)
 
 
