@@ -16,7 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.scale.doubts import CALIBRATE
-from rangesfm.pipeline.plan_again import _planned, plan_of_result
+from rangesfm.pipeline.plan_again import _levelled, _of_run, plan_of_result
 from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import plan_survey
@@ -80,7 +80,7 @@ def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None
     room = rng.uniform((-4.0, -3.0, 0.0), (4.0, 3.0, 2.6), size=(500, 3))
     yard = rng.uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 0.4), size=(500, 3))
     for name, points, highest_m in (("room", room, 2.65), ("yard", yard, 1.85)):
-        planned = _planned(path, points, anchors, "site", np.zeros(3), 2000, {}, Site())
+        planned = _levelled(_of_run(path, anchors, "site", np.zeros(3), {}, Site(), None), points, 2000, None)
         assert planned.walls_are == "edge of what the photos show"
         advice = advise(expect(planned))
         assert any(each.kind == "anchor place" for each in advice), name

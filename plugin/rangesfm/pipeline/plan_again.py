@@ -68,9 +68,8 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
     on_earth, upward = folder.summary.georeference, None if folder.summary.up is None else folder.summary.up[0]
     site = Site(georeference=None if on_earth is None else on_earth.georeference)
-    return _planned(
-        trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m, site, sensor, upward
-    )
+    planned = _of_run(trajectory, anchors, frame, arm, stddevs_m, site, sensor)
+    return _levelled(planned, colored_points(model)[0], len(used), upward)
 
 
 def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georeference | None) -> MetricResult:
@@ -106,10 +105,8 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georefe
         learnt = {} if metric.all_measured is None else metric.all_measured.problem.sizes
         noise = learnt.get("gyro_noise"), learnt.get("accel_noise")
         sensor = PlannedSensor(gyro_noise=noise[0], accel_noise=noise[1]) if all(noise) else None
-        planned = _planned(
-            trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs, site, sensor, metric.upward
-        )
-        expected = expect(planned)
+        planned = _of_run(trajectory, anchors, frame, arm, stddevs, site, sensor)
+        expected = expect(_levelled(planned, points_m, int(used.sum()), metric.upward))
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
@@ -118,40 +115,44 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georefe
     return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
 
 
-def _planned(
+def _of_run(
     trajectory: Trajectory,
-    points_m: Array,
     anchors: Sequence[Anchor],
     frame: str,
     tag_in_cam_m: Array,
-    num_ranges: int,
     component_stddevs: Mapping[str, float],
     site: Site,
-    sensor: PlannedSensor | None = None,
-    upward: Array | None = None,
+    sensor: PlannedSensor | None,
 ) -> PlannedSurvey:
-    """Return the plan with z up, inside what the photos show, and with assumed times where the photos have none.
-
-    Args:
-        points_m: (n, 3) points of the map. upward: (3,) unit vector in it, as measured; None: the photos tell it.
-    """
-    is_site = frame == "site"
-    level = np.eye(3) if is_site else level_axes(trajectory, up_in_world(trajectory, "auto", upward))
+    """Return the survey of a run as a plan in the axes of its map, with assumed times where the photos have none."""
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
-    planned = PlannedSurvey(
-        trajectory=replace(trajectory.transformed(1.0, level, np.zeros(3)), timestamps_s=times),
-        anchors=tuple(replace(a, position_m=level @ np.array(a.position_m)) for a in anchors),
+    return PlannedSurvey(
+        trajectory=replace(trajectory, timestamps_s=times),
+        anchors=tuple(anchors),
         anchor_frame=frame,
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
         sensor=sensor,
         times_are_known=trajectory.timestamps_s is not None,
-        site=site if is_site else Site(),
-        axes="" if is_site else _AXES,
-        level="" if is_site else _LEVEL,
+        site=site,
     )
-    return _inside(planned.ranging(num_ranges) if anchors else planned, points_m @ level.T)
+
+
+def _levelled(of_run: PlannedSurvey, points_m: Array, num_ranges: int, upward: Array | None) -> PlannedSurvey:
+    """Return the plan with z up, inside what the photos show.
+
+    Args:
+        points_m: (n, 3) points of the map. upward: (3,) unit vector in it, as measured; None: the photos tell it.
+    """
+    if of_run.anchor_frame == "site":
+        level, planned = np.eye(3), of_run
+    else:
+        level = level_axes(of_run.trajectory, up_in_world(of_run.trajectory, "auto", upward))
+        anchors = tuple(replace(a, position_m=level @ np.array(a.position_m)) for a in of_run.anchors)
+        path = of_run.trajectory.transformed(1.0, level, np.zeros(3))
+        planned = replace(of_run, trajectory=path, anchors=anchors, site=Site(), axes=_AXES, level=_LEVEL)
+    return _inside(planned.ranging(num_ranges) if planned.anchors else planned, points_m @ level.T)
 
 
 def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:
