@@ -97,7 +97,6 @@ def test_a_path_that_fits_better_turned_over_is_placed_the_right_way_up(drift_m:
     """A rigid path fits better with the anchors on its wrong side; a path that drifts does not."""
     lap = without_points(lap_of_drift(drift_m, seed, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
     found = run_stages(lap, 0)
-    assert found.diagnosis.causes == ()
     best_m = rmse(
         align_points(lap.trajectory.centers, lap.true_centers_m).apply(lap.trajectory.centers) - lap.true_centers_m
     )
