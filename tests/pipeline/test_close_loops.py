@@ -16,8 +16,9 @@ from tests.simulated.surveys import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
 from rangesfm.estimation.refinement import MapAtRest
-from rangesfm.pipeline.close_loops import RefinedMap, close_loops_of_survey
+from rangesfm.pipeline.close_loops import close_loops_of_survey
 from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.refine_map import RefinedMap
 from rangesfm.pipeline.run import refine_model
 from rangesfm.pipeline.run_results import RunResult, write_results
 from rangesfm.progress import Journal, SilentProgress

@@ -8,26 +8,18 @@ from dataclasses import dataclass, replace
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.pipeline.judge_map import moved_to_estimate
 from rangesfm.pipeline.loop_matching import loop_matching
 from rangesfm.pipeline.matched_map import MatchedMap, MergeTracks
 from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.refine_map import RefinedMap
 from rangesfm.sfm.loops.loop_closure import LoopClosure
 from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.trajectory import Trajectory
-
-
-@dataclass(frozen=True)
-class RefinedMap:
-    """A refined map as a result, and at rest with its equations."""
-
-    metric: MetricResult
-    at_rest: MapAtRest
-
 
 Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap | None]
 """Closes loops of a map and refines it again; None if they are closed in it."""
@@ -112,9 +104,7 @@ def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: Trie
 
 
 def _delivered(metric: MetricResult) -> Trajectory:
-    """Return the path of a refined map as it would be the result: moved as a whole to where its interval lies."""
-    path, at = metric.trajectory.as_in(metric.final), metric.at_refined
-    if at is None or metric.kept_refinement is None:
-        return path
-    change = at.estimate
-    return path.transformed(change.scale, change.rotation, change.translation)
+    """Return the path of a refined map as it would be the result: bent and moved to its best estimate."""
+    if metric.at_refined is not None and metric.kept_refinement is not None:
+        metric = moved_to_estimate(metric, metric.at_refined)
+    return metric.trajectory.as_in(metric.final)

@@ -108,7 +108,7 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
     return diagnosis
 
 
-def _moved(metric: MetricResult, at: JointMap) -> MetricResult:
+def moved_to_estimate(metric: MetricResult, at: JointMap) -> MetricResult:
     """Return the result with the refined map bent and moved as a whole to its best estimate."""
     refinement, bent = metric.kept_refinement, _likely_bend(metric, at)
     assert metric.refined is not None, "a refined map"
@@ -142,7 +142,7 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
     start, at = metric.estimate, metric.all_measured
     try:
         if at.is_at_rest:
-            estimate, metric = start.at_rest(at, survey.scale), _moved(metric, at)
+            estimate, metric = start.at_rest(at, survey.scale), moved_to_estimate(metric, at)
         else:
             if start.method != "two-candidate":  # which has no interval
                 refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)

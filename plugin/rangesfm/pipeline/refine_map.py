@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -19,7 +19,6 @@ from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
 from rangesfm.measurements.source import Measured
-from rangesfm.pipeline.close_loops import RefinedMap
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
@@ -30,6 +29,14 @@ from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import at_most
+
+
+@dataclass(frozen=True)
+class RefinedMap:
+    """A refined map as a result, and at rest with its equations."""
+
+    metric: MetricResult
+    at_rest: MapAtRest
 
 
 def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
