@@ -125,6 +125,21 @@ def test_gravity_says_on_which_side_of_a_wall_with_anchors_a_path_in_a_plane_is(
     assert np.degrees(np.arccos(up[2])) < 1.0
 
 
+def test_positions_in_axes_that_are_not_upright_are_named(
+    survey: Path, tmp_path: Path, rangesfm_command: Command
+) -> None:
+    motion, at_s = by_hand(2, axes=(3.0, 3.0, 3.0)), np.arange(2.0, 59.0, 0.5)
+    x, y, z = (motion.places_m(at_s) + np.random.default_rng(4).normal(0.0, 0.02, (len(at_s), 3))).T
+    flags = ("--antenna_in_cam", "0,0,0", "--positions_time_offset", "0", *SENSOR)
+    said = []
+    for name, axes in (("upright", (x, y, z)), ("y up", (x, z, -y))):
+        write_rows(tmp_path / f"{name}.csv", "timestamp_s,x_m,y_m,z_m", np.column_stack([at_s, *axes]).tolist())
+        result = scaled(survey, tmp_path / name, rangesfm_command, "--positions", str(tmp_path / f"{name}.csv"), *flags)
+        said.append([reason for reason in result["scale"]["reasons"] if "vertical of the inertial sensor" in reason])
+    assert not said[0]
+    assert said[1]
+
+
 def test_a_mistake_in_the_log_is_a_warning(tmp_path: Path, rangesfm_command: Command) -> None:
     write_survey(tmp_path, by_hand(2, axes=(0.5, 0.5, 0.5)), gyro_factor=float(np.degrees(1)))
     result = scaled(tmp_path, tmp_path / "out", rangesfm_command, *SENSOR)

@@ -49,13 +49,15 @@ from rangesfm.solver.posterior import (
     ScaleUncertainty,
     joined,
 )
-from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity
 
 IMU = "imu"
 # Observations from which the sizes of errors are learnt before there are other kinds.
 _NUM_OBSERVATIONS = MAX_NUM_OBSERVATIONS // 3
+# Sites lean less than this, radians: floors, tripods and motion capture are levelled to a degree.
+_LEANS_RAD = float(np.radians(3.0))
 # Relative change of the sizes of errors from which weights do not matter.
 _SAME_SIZE = 0.1
 
@@ -114,9 +116,23 @@ class InertialScale(KindOnMap):
         return self._observed(placed.scale, max_num)[0]
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
-        """Return the tests of the scale against other kinds, and whether sensor and photos are of one motion."""
+        """Return the tests of scale and vertical against other kinds, and whether log and photos are of one motion."""
         found = super().tests(on_map, by_kind)
-        return replace(found, reasons=(*found.reasons, *self._misfits(on_map.problem)))
+        return replace(found, reasons=(*found.reasons, *self._misfits(on_map.problem), *self._leaning(on_map)))
+
+    def _leaning(self, on_map: JointMap) -> Iterator[str]:
+        """Yield that the site in which others place the map is not upright."""
+        placement = on_map.posterior.placement
+        if placement is None:
+            return
+        upward = on_map.estimate.rotation @ self.problem.path.world_from_cam[0] @ self.upward.up_in_first_camera
+        angle = float(np.arccos(np.clip(upward @ UP_IN_SITE, -1.0, 1.0)))
+        stddev = float(np.sqrt(np.linalg.eigvalsh(placement[1:3, 1:3])[-1] + self.upward.stddev_rad**2))
+        if angle > SIGNIFICANT_STDDEVS * stddev and angle > _LEANS_RAD:
+            yield (
+                f"the z axis of the site leans by {np.degrees(angle):.0f} degrees from the vertical of the inertial "
+                "sensor: expected coordinates with z up"
+            )
 
     def _misfits(self, problem: JointProblem) -> Iterator[str]:
         """Yield what errs far more than such sensors and photos do."""
