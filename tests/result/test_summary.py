@@ -170,6 +170,9 @@ def test_loops_and_unnoticed_mistakes_are_told_in_sentences() -> None:
         "loops: the map suggests that 309 pairs of photos show the same place; 60 of them match; 15 were used to close "
         "loops, which moved the map by 0.021 m (rms); 2 contradict the measurements and were not used"
     ) in lines
+    agreeing = result_document(loops={**loops, "num_closed": 0, "num_contradicted": 0})
+    lines += ResultSummary.model_validate(agreeing).lines(Path("out"), None)
+    assert any(line.endswith("60 of them match; the map agrees with these as it is") for line in lines)
     assert (
         "reliability: if one mistake was made and not noticed, the scale is off by 7.7 % at most (risk of more: "
         "0.0001); worst case: lever arm"

@@ -179,11 +179,13 @@ def _reliable(reliability: entries.ReliabilityEntry) -> str:
 
 def _closed(loops: entries.LoopsEntry) -> str:
     """Return the line that says which loops were closed."""
+    agree = loops.num_closed == 0 and loops.num_verified > loops.num_contradicted
+    used = "the map agrees with these as it is" if agree else f"{loops.num_closed} were used to close loops"
     moved = f", which moved the map by {loops.moved_m:.2g} m (rms)" if loops.num_closed else ""
     contradicted = f"; {loops.num_contradicted} contradict the measurements and were not used"
     return (
         f"loops: the map suggests that {loops.num_proposed} pairs of photos show the same place; {loops.num_verified} "
-        f"of them match; {loops.num_closed} were used to close loops{moved}"
+        f"of them match; {used}{moved}"
         f"{contradicted if loops.num_contradicted else ''}"
     )
 
