@@ -319,8 +319,7 @@ class PointOptions(Options, table="points"):
     path: Annotated[Path | None, KeyMeta(flag="points", role="file", is_common=True)] = None
     """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, ODM's
     gcp_list.txt, or Metashape's markers (XML). A control point determines the map, a check point is only compared with
-    it. The photos that show them are in the file of markers in [scale], in gcp_list.txt or Metashape's file, or found
-    (printed tags)."""
+    it. The photos that show them are in that file, in that of [scale] markers, or found (printed tags)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="point_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for marker, x, y, z, stddev and kind; x is
     east and y north, if they are such (default: recognised)."""

@@ -460,16 +460,21 @@ def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("model", "refine", "stage"),
-    [(None, True, "_from_photos"), ("m", True, "refine_model"), ("m", False, "scale_model")],
+    ("model", "refine", "begins"),
+    [(None, True, "from photos"), ("m", True, "from a model, refined"), ("m", False, "from a model")],
 )
 def test_a_survey_begins_with_its_photos_or_with_its_model(
-    model: str | None, refine: bool, stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: str | None, refine: bool, begins: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[str] = []
-    for name in ("_from_photos", "refine_model", "scale_model"):
-        monkeypatch.setattr(run, name, lambda survey, *_, name=name, **__: begun.append(name))
+
+    def from_model(*_: object, refine: bool, or_scale: bool) -> None:
+        assert or_scale
+        begun.append("from a model" + refine * ", refined")
+
+    monkeypatch.setattr(run, "_from_photos", lambda *_, **__: begun.append("from photos"))
+    monkeypatch.setattr(run, "_from_model", from_model)
     images = {"path": "photos"} | ({} if model is None else {"model": model})
     survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
     run.run_survey(survey, progress=SilentProgress())
-    assert begun == [stage]
+    assert begun == [begins]

@@ -52,8 +52,16 @@ def test_a_coordinate_system_needs_positions_on_the_earth(frame: str, position: 
 @pytest.mark.parametrize(
     ("of_site", "of_points", "said"),
     [
-        (None, "EPSG:2056", "these coordinates have a coordinate system and the anchors have none"),
-        ("EPSG:2056", None, "the anchors have a coordinate system and these coordinates have none"),
+        (
+            None,
+            "EPSG:2056",
+            "these coordinates have a coordinate system and those of the anchors or control points have none",
+        ),
+        (
+            "EPSG:2056",
+            None,
+            "those of the anchors or control points have a coordinate system and these coordinates have none",
+        ),
     ],
 )
 def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
