@@ -120,8 +120,9 @@ def likely_bend(at_rest: JointMap) -> FrameSteps:
     if not isinstance(bending, PhotoBending):
         return NO_STEPS
     by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
-    is_free = known.columns.frame >= 0
-    return bending.likely_steps(known.pulls @ by_pose, problem.bending_factor, frame_is_free=is_free)
+    # What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
+    factor, is_free = min(problem.bending_factor, LARGEST_FACTOR), known.columns.frame >= 0
+    return bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
 
 
 def bending_of_model(
