@@ -30,6 +30,7 @@ from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
@@ -80,14 +81,14 @@ class PhotoBending:
                 what the estimate leaves of them, measured minus predicted.
             factor: learnt bending over that expected from the photos. frame_is_free: as in ``of_functions``.
         """
-        of_path = similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
-        motions = motions_of_poses(self.path.world_from_cam, self.path.centers - self.path.centers[0]).reshape(-1, 7)
-        parts = (factor**2 * (pull - (pull @ motions) @ of_path)).reshape(-1, 6)
+        function = without_similarity(pull[None], self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
+        parts = factor**2 * function.reshape(-1, 6)
         by_center = parts[:, 3:] @ self.world_from_model.T / self.metres_per_unit
         frame_ids, poses = self.photos.poses
         steps = self.photos.likely_steps(self.frame_ids, parts[:, :3], by_center)
         found = FrameSteps(frame_ids, steps[:, :3], steps[:, 3:])
         turns, shifts_m = found.at(self.frame_ids)
+        of_path = similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
         whole = of_path @ np.hstack([turns, shifts_m @ self.world_from_model / self.metres_per_unit]).ravel()
         whole[1:4] = self.world_from_model @ whole[1:4]
         whole[4:] = self.metres_per_unit * self.world_from_model @ whole[4:]
@@ -110,11 +111,14 @@ class PhotoBending:
         return bool(covariance[0, 0] < _HELD**2)
 
 
-def likely_bend(at_rest: JointMap) -> FrameSteps:
+def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
     """Return where photos and all that is measured have the frames of a map at rest, before it moves as a whole.
 
     It is their expected bending after all that is observed: Rasmussen and Williams, "Gaussian processes for machine
     learning", 2006, eq. 2.42. A map whose photos say nothing of it stays as it is.
+
+    Args:
+        unscaled: the path of the unscaled model. The scale of the similarity to it stays as it is.
     """
     problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
     if not isinstance(bending, PhotoBending):
@@ -122,7 +126,11 @@ def likely_bend(at_rest: JointMap) -> FrameSteps:
     by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
     # What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
     factor, is_free = min(problem.bending_factor, LARGEST_FACTOR), known.columns.frame >= 0
-    return bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
+    steps = bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
+    firm_m = (at_rest.path.centers + steps.at(bending.frame_ids)[1])[bending.is_firm]
+    size = at_rest.metres_per_unit / align_points(unscaled.centers[bending.is_firm], firm_m).scale
+    from_first_m = bending.photos.poses[1].centers - at_rest.path.centers[0]
+    return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)
 
 
 def bending_of_model(

@@ -10,7 +10,6 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
@@ -24,12 +23,9 @@ from rangesfm.measurements.joint_map import Doubt, JointMap
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.refine_map import metres_per_unit_of
-from rangesfm.solver.bending import FrameSteps
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
-from rangesfm.util.geometry.poses import model_poses
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:
@@ -110,7 +106,7 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
 
 def moved_to_estimate(metric: MetricResult, at: JointMap) -> MetricResult:
     """Return the result with the refined map bent and moved as a whole to its best estimate."""
-    refinement, bent = metric.kept_refinement, _likely_bend(metric, at)
+    refinement, bent = metric.kept_refinement, likely_bend(at, metric.trajectory)
     assert metric.refined is not None, "a refined map"
     assert refinement is not None, "a refined map"
     for moved in (moved for each in at.kinds for moved in each.moved_ranges(at.posterior, bent)):
@@ -119,18 +115,6 @@ def moved_to_estimate(metric: MetricResult, at: JointMap) -> MetricResult:
     if len(bent.frame_ids):
         bend(refined, bent)
     return replace(metric, refined=rescale(refined, at.estimate), refinement=refinement)
-
-
-def _likely_bend(metric: MetricResult, at: JointMap) -> FrameSteps:
-    """Return the steps of ``likely_bend`` with the scale of the similarity to the unscaled model left as it is."""
-    assert metric.refined is not None, "a refined map"
-    bent, path, unscaled = likely_bend(at), at.path, metric.trajectory
-    if not len(bent.frame_ids):
-        return bent
-    bent_m, centers_m = path.centers + bent.at(path.frame_ids)[1], model_poses(metric.refined, bent.frame_ids).centers
-    scale = metres_per_unit_of(unscaled, replace(path, centers=bent_m), frames_of_largest_part(metric.refined))
-    first_m, size = path.centers[0], at.metres_per_unit / scale
-    return bent._replace(shifts_m=first_m + size * (centers_m + bent.shifts_m - first_m) - centers_m)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:

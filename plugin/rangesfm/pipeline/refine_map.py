@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Indices
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.diagnostics.finished_map import why_broken
 from rangesfm.errors import GeometryError, SolverError
@@ -176,19 +175,14 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def metres_per_unit_of(unscaled: Trajectory, path: Trajectory, firm_ids: Indices) -> float:
-    """Return the scale of the similarity that fits the centres of the firm frames of two paths best."""
-    is_firm = np.isin(path.frame_ids, firm_ids)
-    return align_points(unscaled.centers[is_firm], path.centers[is_firm]).scale
-
-
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
     """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
     start, model = metric.estimate.on_map, rest.problem.metric
     if not start.kinds:
         return None
     path = metric.trajectory.as_in(model)
-    scale = metres_per_unit_of(metric.trajectory, path, rest.firm_ids)
+    is_firm = np.isin(path.frame_ids, rest.firm_ids)
+    scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
     of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
     located, _ = kinds_in_map(_inputs(run, metric), of_model)

@@ -177,10 +177,7 @@ class PhotosAlone:
         Returns:
             (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
         """
-        gradients = np.zeros((len(self._gradient), len(by_turn)))
-        for frame_id, pose, rows in self._free_poses():
-            for k in np.flatnonzero(frame_ids == frame_id):
-                gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T
+        gradients = self._by_steps(frame_ids, by_turn, by_center)
         solution = self._inverse.solve(gradients)
         return self._stddev**2 * gradients.T @ solution, -solution.T @ self._gradient
 
@@ -193,11 +190,8 @@ class PhotosAlone:
             frame_ids: (k,). by_turn, by_center: (k, 3) pull of what was measured on them: minus the derivatives, as of
                 ``of_functions``, of half its sum of squares.
         """
-        pulls = np.zeros(len(self._gradient))
-        for frame_id, pose, rows in self._free_poses():
-            for k in np.flatnonzero(frame_ids == frame_id):
-                pulls[rows] = np.append(by_turn[k], by_center[k]) @ _pose_from_step(pose)
-        solution = self._inverse.solve(np.column_stack([self._stddev**2 * pulls, -self._gradient])).sum(axis=1)
+        pulls = self._stddev**2 * self._by_steps(frame_ids, by_turn[None], by_center[None])[:, 0]
+        solution = self._inverse.solve(np.column_stack([pulls, -self._gradient])).sum(axis=1)
         steps = np.zeros((len(self._columns.frames), 6))
         for frame_id, pose, rows in self._free_poses():
             steps[self._columns.frames == frame_id] = _pose_from_step(pose) @ solution[rows]
@@ -209,6 +203,17 @@ class PhotosAlone:
         turns = np.array([rotation_of(pose).T for pose in self._columns.poses])
         shifts = np.array([pose[4:] for pose in self._columns.poses])
         return self._columns.frames, Poses(turns, -np.einsum("mij,mj->mi", turns, shifts))
+
+    def _by_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
+        """Return the derivatives (size, c) by the steps of the equations; arguments as of ``of_functions``."""
+        gradients, place = (
+            np.zeros((len(self._gradient), len(by_turn))),
+            {f: k for k, f in enumerate(frame_ids.tolist())},
+        )
+        for frame_id, pose, rows in self._free_poses():
+            if (k := place.get(frame_id)) is not None:
+                gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T
+        return gradients
 
     def _free_poses(self) -> Iterator[tuple[int, Array, slice]]:
         """Yield the id, the pose and the rows in the equations of each frame that is not held."""
