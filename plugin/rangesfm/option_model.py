@@ -158,10 +158,10 @@ class Options(BaseModel):
     @classmethod
     @cache
     def keys(cls) -> Mapping[str, Key]:
-        """Return all keys of this table by name."""
+        """Return all keys of this table by name, those that it shares with other tables last."""
         bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
         keys = {}
-        for name, field in cls.model_fields.items():
+        for name, field in sorted(cls.model_fields.items(), key=lambda item: item[0] not in cls.__annotations__):
             meta = next((item for item in field.metadata if isinstance(item, KeyMeta)), KeyMeta())
             if not meta.is_key:
                 continue

@@ -94,8 +94,8 @@ _TimeUnit = Literal["s", "ms", "us", "ns", "ticks", "min", "h", "d", "iso", "dmy
 _LengthUnit = Literal["m", "cm", "mm", "ft"]
 
 
-class KeyframeOptions(Options, table="images"):
-    """Choice of the photos that become keyframes. All keys that are given apply together."""
+class ImageOptions(Options, table="images"):
+    """The photos. Of the keys that choose keyframes, all that are given apply together."""
 
     every_nth: Annotated[_Count, KeyMeta(is_common=True)] = 1
     """Use every n-th photo, in order of time."""
@@ -103,11 +103,6 @@ class KeyframeOptions(Options, table="images"):
     """Shortest time between two keyframes."""
     max_num_keyframes: Annotated[int, Field(ge=3, le=1_000_000)] | None = None
     """Largest number of keyframes; the photos are thinned evenly to it (default: no limit)."""
-
-
-class ImageOptions(KeyframeOptions):
-    """The photos."""
-
     path: Annotated[Path | None, KeyMeta(flag="images", metavar="PATH", role="photos", is_common=True)] = None
     """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
     the photos' times."""
@@ -205,8 +200,20 @@ class CameraOptions(Options, table="camera"):
         return self.focal_length_stddev_px or _CALIBRATION_STDDEV * focal_length_px
 
 
-class LogOptions(Options, table="ranges"):
-    """The radio's log and how it is read."""
+class RangeModelOptions(Options, table="ranges"):
+    """Assumptions about the radio's errors."""
+
+    range_stddev_m: _Positive | None = None
+    """Standard deviation of the noise of a range (default: estimated from the residuals)."""
+    range_bias_stddev_m: Uncertainty = 0.01
+    """Standard deviation of the prior of each anchor's own constant bias, mean 0. It is small on purpose: a freer bias
+    absorbs errors that depend on direction, and shifts the map."""
+    common_bias_stddev_m: Uncertainty = 0.1
+    """Standard deviation of the prior of the bias that is common to all anchors (the tag's delay), mean 0."""
+
+
+class RangesOptions(RangeModelOptions):
+    """The radio's log, how its ranges are placed on the path, assumptions about its errors, and checks."""
 
     path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
@@ -247,25 +254,11 @@ class LogOptions(Options, table="ranges"):
     ] = "auto"
     """Time offset between the clocks: image time = range time + offset. auto: it is searched for."""
 
-    @property
-    def time_offset_s(self) -> float | None:
-        """Return the given time offset, or None where it is to be searched for."""
-        return None if self.time_offset == "auto" else self.time_offset
-
-
-class AssociationOptions(Options, table="ranges"):
-    """Placing of each range on the camera's path."""
-
     max_interpolation_gap_s: _Duration = 2.0
     """Longest time between two keyframes between which poses are interpolated."""
     max_time_difference_s: _Duration = 0.02
     """Largest time between a range and a keyframe at which the range counts as taken at the keyframe, where no pose can
     be interpolated."""
-
-
-class CheckOptions(Options, table="ranges"):
-    """Ranges that take no part in any estimate and are compared with the result (checks)."""
-
     check_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Fraction of the ranges that are checks, chosen at random, and take no part in the estimate. This is the mildest
     check, because ranges that are close in time have the same errors."""
@@ -276,21 +269,10 @@ class CheckOptions(Options, table="ranges"):
     ] = ()
     """First and last time, on the radio's clock; the ranges between them are checks."""
 
-
-class RangeModelOptions(Options, table="ranges"):
-    """Assumptions about the radio's errors."""
-
-    range_stddev_m: _Positive | None = None
-    """Standard deviation of the noise of a range (default: estimated from the residuals)."""
-    range_bias_stddev_m: Uncertainty = 0.01
-    """Standard deviation of the prior of each anchor's own constant bias, mean 0. It is small on purpose: a freer bias
-    absorbs errors that depend on direction, and shifts the map."""
-    common_bias_stddev_m: Uncertainty = 0.1
-    """Standard deviation of the prior of the bias that is common to all anchors (the tag's delay), mean 0."""
-
-
-class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOptions):
-    """The radio's log, assumptions about its errors, and ranges that are checks."""
+    @property
+    def time_offset_s(self) -> float | None:
+        """Return the given time offset, or None where it is to be searched for."""
+        return None if self.time_offset == "auto" else self.time_offset
 
 
 class AnchorOptions(Options, table="anchors"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.options import KeyframeOptions
+from rangesfm.options import ImageOptions
 from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.sfm.keyframes import select_keyframes
 
@@ -17,7 +17,7 @@ def photos_at(*timestamps_s: float) -> ImageTimes:
 
 
 def select(image_times: ImageTimes, **options: float | None) -> list[int]:
-    return [int(name) for name in select_keyframes(image_times, KeyframeOptions(**options))]  # type: ignore[arg-type]
+    return [int(name) for name in select_keyframes(image_times, ImageOptions(**options))]  # type: ignore[arg-type]
 
 
 def test_all_photos_are_keyframes_by_default() -> None:
@@ -67,6 +67,6 @@ def test_refuses_options_that_leave_nothing_to_reconstruct(options: dict[str, fl
 
 def test_photos_without_times_keep_the_order_of_their_names() -> None:
     names = [f"{k}.jpg" for k in range(10)]
-    assert select_keyframes(names, KeyframeOptions(every_nth=3)) == ("0.jpg", "3.jpg", "6.jpg", "9.jpg")
+    assert select_keyframes(names, ImageOptions(every_nth=3)) == ("0.jpg", "3.jpg", "6.jpg", "9.jpg")
     with pytest.raises(InputError, match="min_interval_s is 1, but the photos have no times"):
-        select_keyframes(names, KeyframeOptions(min_interval_s=1.0))
+        select_keyframes(names, ImageOptions(min_interval_s=1.0))

@@ -44,7 +44,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.options import AssociationOptions, ScaleOptions
+from rangesfm.options import RangesOptions, ScaleOptions
 from rangesfm.util.geometry.reference import Reference, read_reference
 from rangesfm.util.geometry.similarity import rmse
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -157,7 +157,7 @@ def placed(
     offset_s = described.get("time_offset_s", 0.0)
     if by_photo:
         part, path, offset_s = at_photos(part, path, offset_s)
-    options = AssociationOptions(max_interpolation_gap_s=max(described.get("max_gap_s", 0.0), MAX_GAP_S))
+    options = RangesOptions(max_interpolation_gap_s=max(described.get("max_gap_s", 0.0), MAX_GAP_S))
     return associate(part, path, arms, time_offset_s=offset_s, options=options)
 
 

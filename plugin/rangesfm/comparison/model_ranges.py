@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -36,7 +36,7 @@ class ModelRanges:
     biases_m: Mapping[str, float]
     image_times_s: Mapping[str, float] | None
     metric_path: Trajectory
-    association: AssociationOptions
+    association: RangesOptions
 
     def residuals_m(self, path: Trajectory) -> Array:
         """Return predicted minus measured ranges, (k,) metres, of the k ranges with a place on a metric path."""

@@ -26,7 +26,7 @@ from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
 from rangesfm.option_model import Options
-from rangesfm.options import AssociationOptions, RangeModelOptions
+from rangesfm.options import RangeModelOptions, RangesOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.util.geometry.gravity import Gravity
@@ -61,7 +61,7 @@ class PlannedAntenna(Options, table="positions"):
         covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
         nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
         log = PositionLog(nowhere, covariance_m2, times_s, None, lines)
-        found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, AssociationOptions()), path)
+        found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, RangesOptions()), path)
         return replace(found, position_m=found.predicted_m(IDENTITY))
 
 

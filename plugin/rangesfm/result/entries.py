@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from rangesfm.options import COORDINATE_M, AssociationOptions
+from rangesfm.options import COORDINATE_M, RangesOptions
 from rangesfm.util.files.records import (
     Count,
     Flag,
@@ -523,8 +523,10 @@ class RangesSettings(_Table):
     max_time_difference_s: Number
 
     @property
-    def association(self) -> AssociationOptions:
-        return AssociationOptions(**{name: getattr(self, name) for name in AssociationOptions.model_fields})
+    def association(self) -> RangesOptions:
+        return RangesOptions(
+            max_interpolation_gap_s=self.max_interpolation_gap_s, max_time_difference_s=self.max_time_difference_s
+        )
 
 
 class AnchorSettings(_Table):

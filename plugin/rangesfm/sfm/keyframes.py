@@ -8,14 +8,14 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.options import KeyframeOptions
+from rangesfm.options import ImageOptions
 from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.util.geometry.trajectory import ROUNDING_S
 
 MIN_NUM_KEYFRAMES = 3
 
 
-def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOptions) -> tuple[str, ...]:
+def select_keyframes(photos: ImageTimes | Sequence[str], options: ImageOptions) -> tuple[str, ...]:
     """Return the names of the keyframes in time order, or in the given order for photos without times.
 
     Every n-th photo is taken. Of these, those at least ``min_interval_s`` apart are kept. If these are more than

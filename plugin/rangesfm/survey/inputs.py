@@ -26,7 +26,7 @@ from rangesfm.measurements.ranges.anchors.site import Site, local_site, site_of
 from rangesfm.measurements.ranges.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
-from rangesfm.options import LogOptions
+from rangesfm.options import RangesOptions
 from rangesfm.sfm.exif_positions import read_exif_positions
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
@@ -242,7 +242,7 @@ def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> No
 
 
 def read_log(
-    options: LogOptions,
+    options: RangesOptions,
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
     *,

@@ -27,7 +27,7 @@ from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
+from rangesfm.options import RangeModelOptions, RangesOptions, ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
@@ -365,7 +365,7 @@ def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
 
 def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE, num_epochs=2)
-    held_out = hold_out(survey.observations(), CheckOptions(check_share=0.2), seed=0)
+    held_out = hold_out(survey.observations(), RangesOptions(check_share=0.2), seed=0)
     is_check = held_out.status == RangeStatus.CHECK
     spoilt = survey.observations(survey.log_with(np.where(is_check, 1.0, survey.simulated.log.range_m)))
     spoilt.status[is_check] = RangeStatus.CHECK

@@ -14,7 +14,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -58,7 +58,7 @@ def track(places: Places, times_s: Array, num_wrong: int = 0, offset_s: float | 
     at_m = places(times_s) + [1012.0, 5003.0, 413.0] + NOISE_M * rng.standard_normal((len(times_s), 3))
     at_m[rng.permutation(len(at_m))[:num_wrong]] += rng.normal(0.0, 20.0, (num_wrong, 3))
     log = PositionLog(at_m, np.full((len(at_m), 3, 3), np.nan), times_s + AHEAD_S, None, np.arange(len(at_m)))
-    return AntennaTrack(log, np.zeros(3), offset_s, AssociationOptions())
+    return AntennaTrack(log, np.zeros(3), offset_s, RangesOptions())
 
 
 def photos(places: Places, times_s: Array = PHOTOS_S) -> Trajectory:

@@ -14,12 +14,12 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
-WITHOUT_SNAPPING = AssociationOptions(max_time_difference_s=0.0)
+WITHOUT_SNAPPING = RangesOptions(max_time_difference_s=0.0)
 
 
 def trajectory_of(times: Array | None, centers: Array, world_from_cam: Array | None = None) -> Trajectory:
@@ -196,7 +196,7 @@ class TestCoarseTimes:
         written = np.rint(photo_times / photo_step_s) * photo_step_s if photo_step_s else photo_times
         path = replace(trajectory_of(written, walk(photo_times)), time_resolution_s=photo_step_s)
         log = log_at(np.rint(range_times / range_step_s) * range_step_s if range_step_s else range_times)
-        found = associate(log, path, np.zeros(3), options=AssociationOptions(max_interpolation_gap_s=5.0))
+        found = associate(log, path, np.zeros(3), options=RangesOptions(max_interpolation_gap_s=5.0))
         error = np.sqrt(np.sum((found.centers - walk(range_times)) ** 2, axis=1) / 3)
         return float(np.sqrt(np.mean((error / found.center_stddev) ** 2))), float(np.median(found.center_stddev))
 
@@ -231,7 +231,7 @@ class TestLongGaps:
 
     def test_the_limit_is_an_option(self) -> None:
         path = trajectory_of(self.TIMES, straight(self.TIMES))
-        found = associate(log_at([12.0]), path, TAG_IN_CAM_M, options=AssociationOptions(max_interpolation_gap_s=5.0))
+        found = associate(log_at([12.0]), path, TAG_IN_CAM_M, options=RangesOptions(max_interpolation_gap_s=5.0))
         np.testing.assert_allclose(found.centers[0], straight(np.array([12.0]))[0], atol=1e-9)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from rangesfm.arrays import Array
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.clock.offset import Rival, TimeOffset
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class AntennaTrack:
     log: PositionLog
     antenna_in_cam_m: Array
     offset_s: float | None
-    association: AssociationOptions
+    association: RangesOptions
     offset_stddev_s: float = 0.0
     other_offset_s: float | None = None
     search: TimeOffset | None = None

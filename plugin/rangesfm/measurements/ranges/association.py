@@ -13,7 +13,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.geometry.motion_prior import learn_motion
 from rangesfm.util.geometry.robust_statistics import robust_stddev
@@ -34,7 +34,7 @@ def associate(
     tag_in_cam_m: npt.ArrayLike,
     *,
     time_offset_s: float | Array = 0.0,
-    options: AssociationOptions = AssociationOptions(),
+    options: RangesOptions = RangesOptions(),
     anchor_ids: Collection[str] | None = None,
 ) -> RangeObservations:
     """Find the camera pose at which each range was taken.
@@ -96,7 +96,7 @@ def associate(
     return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
 
 
-def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
+def is_too_long(gaps_s: npt.ArrayLike, options: RangesOptions) -> Mask:
     """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
     return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
 
@@ -126,7 +126,7 @@ def places_on_path(
     fraction: Array,
     *,
     time_resolution_s: float,
-    options: AssociationOptions,
+    options: RangesOptions,
 ) -> PlacesOnPath:
     """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
 
@@ -149,7 +149,7 @@ def places_on_path(
 
 
 def _places_by_time(
-    log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
+    log: RangeLog, times: Array, keyframe_times: Array, options: RangesOptions, status: npt.NDArray[np.int8]
 ) -> tuple[Indices, Indices, Array]:
     """Return the keyframes before and after each time, and the fraction of the later one.
 
@@ -261,7 +261,7 @@ def _timing_stddev(
     before: Indices,
     after: Indices,
     fraction: Array,
-    options: AssociationOptions,
+    options: RangesOptions,
 ) -> Array:
     """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
 

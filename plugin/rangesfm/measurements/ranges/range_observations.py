@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.options import CheckOptions
+from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.similarity import Similarity
 
 
@@ -115,7 +115,7 @@ class RangeObservations:
         return np.asarray(order[self.has_place[order]])
 
 
-def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
+def hold_out(observations: RangeObservations, checks: RangesOptions, seed: int) -> RangeObservations:
     """Hold out ranges as checks: those of some anchors, those of an interval of time, and a random share of the rest.
 
     Raises:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.options import LogOptions
+from rangesfm.options import RangesOptions
 
 VACUUM_M_PER_S = 299_792_458.0
 AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
@@ -40,7 +40,7 @@ class StampOptions:
     t_off_s: float = 0.0
 
     @classmethod
-    def from_log_options(cls, options: LogOptions) -> StampOptions:
+    def from_log_options(cls, options: RangesOptions) -> StampOptions:
         speeds: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
         speed = options.propagation_speed
         return cls(

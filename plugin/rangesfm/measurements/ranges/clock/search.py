@@ -23,7 +23,7 @@ from rangesfm.measurements.ranges.clock.offset import CostCurve
 from rangesfm.measurements.ranges.clock.squares import MIN_RANGE_M
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.similarity import rounding_of
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -113,7 +113,7 @@ class PathSamples:
         return here + (place - before)[:, None] * step, step / self.step_s
 
 
-def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
+def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: RangesOptions) -> PathSamples:
     """Sample the path where poses are interpolated between keyframes.
 
     Args:

@@ -34,7 +34,7 @@ from rangesfm.measurements.ranges.clock.search import (
 )
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
-from rangesfm.options import AssociationOptions
+from rangesfm.options import RangesOptions
 from rangesfm.progress import SILENT, Progress
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
@@ -71,7 +71,7 @@ def estimate_time_offset(
     trajectory: Trajectory,
     tag_in_cam_m: npt.ArrayLike,
     *,
-    association: AssociationOptions = AssociationOptions(),
+    association: RangesOptions = RangesOptions(),
     seed: int = 0,
     progress: Progress = SILENT,
 ) -> TimeOffset:
@@ -139,7 +139,7 @@ def require_enough(trajectory: Trajectory, num: int, kind: ObservedKind) -> None
         )
 
 
-def path_to_search(trajectory: Trajectory, antennas_in_cam_m: Array, association: AssociationOptions) -> PathSamples:
+def path_to_search(trajectory: Trajectory, antennas_in_cam_m: Array, association: RangesOptions) -> PathSamples:
     """Sample the path of keyframes with times, also across longer gaps than those in which observations are used.
 
     Args:
@@ -213,7 +213,7 @@ def offset_of_motion(
 
 
 def _offset_of_bursts(
-    bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: AssociationOptions
+    bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: RangesOptions
 ) -> TimeOffset | None:
     """Return the offset that centres each burst on its photo, or None if the camera did not stand still in them."""
     pairings = pair_bursts(bursts, trajectory, tags_in_cam_m)
@@ -245,9 +245,7 @@ def _offset_of_bursts(
     )
 
 
-def _num_at_same_photo(
-    log: RangeLog, trajectory: Trajectory, association: AssociationOptions, *offsets_s: float
-) -> int:
+def _num_at_same_photo(log: RangeLog, trajectory: Trajectory, association: RangesOptions, *offsets_s: float) -> int:
     """Return the number of ranges that are associated with the same photo at all of the offsets."""
     photos = []
     for offset_s in offsets_s:

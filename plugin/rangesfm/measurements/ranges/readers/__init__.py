@@ -20,7 +20,7 @@ from rangesfm.measurements.ranges.readers.held import without_held
 from rangesfm.measurements.ranges.readers.printed import PRINTED
 from rangesfm.measurements.ranges.readers.reader import Reader, ReadOptions, tell_roles
 from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
-from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOptions
+from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, RangesOptions
 from rangesfm.util.files.bags import is_bag_folder
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.folders import natural_order
@@ -39,7 +39,7 @@ def reader_names() -> tuple[str, ...]:
 
 def read_ranges(
     path: AnyPath | Sequence[AnyPath],
-    options: LogOptions = LogOptions(),
+    options: RangesOptions = RangesOptions(),
     *,
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
@@ -67,7 +67,7 @@ def read_ranges(
             has no usable range. The error gives the line if there is one.
     """
     paths = _paths(path)
-    table = {name: getattr(options, name) for name in LogOptions.model_fields}
+    table = {name: getattr(options, name) for name in RangesOptions.model_fields}
     reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
     chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else ""))
     logs = [reader.read(file, reading) for file, reader in chosen]

@@ -12,10 +12,10 @@ from pathlib import Path
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.options import LogOptions
+from rangesfm.options import RangesOptions
 
 
-class ReadOptions(LogOptions):
+class ReadOptions(RangesOptions):
     """The user's options for reading a log."""
 
     given: tuple[str, ...] = ()
