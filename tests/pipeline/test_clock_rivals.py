@@ -12,7 +12,6 @@ import pytest
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.clock.offset import CostCurve, Rival, TimeOffset
 from rangesfm.pipeline.clock_rivals import scale_by_rivals
-from rangesfm.survey.survey_run import Clock
 from rangesfm.util.geometry.similarity import Similarity
 
 VALUE_S, RIVAL_S = 1.0, 4.0
@@ -36,9 +35,8 @@ class Scales:
                 raise GeometryError("no scale")
             return estimate(scale, rival_m, self.frame)
 
-        return scale_by_rivals(
-            estimate(2.0, (0.0, 0.0, 0.0), self.frame), path, Clock("", offset, "give it", estimate_at)
-        )
+        here = estimate(2.0, (0.0, 0.0, 0.0), self.frame)
+        return scale_by_rivals(here, path, offset, estimate_at, "", "give it")
 
 
 def estimate(scale: float, at_m: tuple[float, float, float], frame: str) -> Any:

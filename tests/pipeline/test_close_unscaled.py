@@ -13,7 +13,7 @@ from tests.simulated.looped import LoopedSurvey, Matches, Pair, around_a_room, t
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
-from rangesfm.pipeline.close_unscaled import close_loops_of_models
+from rangesfm.pipeline.close_loops import close_loops_of_models
 from rangesfm.progress import SILENT, Journal, Progress, SilentProgress
 from rangesfm.sfm.loop_database import LoopMatching
 from rangesfm.sfm.loops.candidates import Views

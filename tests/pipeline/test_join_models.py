@@ -28,7 +28,8 @@ from rangesfm.measurements.ranges.anchors.site import local_site
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
-from rangesfm.pipeline.join_models import JoinedModels, join_models
+from rangesfm.pipeline.join_models import join_models
+from rangesfm.pipeline.metric_result import ModelVerdict
 from rangesfm.pipeline.run import run_survey, scale_model
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.sfm.reconstruct import ReconstructionSummary
@@ -68,7 +69,10 @@ class Halves:
         parts = (replace(p, observations=associate(log, p.trajectory, TAG_IN_CAM_M)) for p in self.parts)
         return replace(self, log=log, parts=tuple(parts))
 
-    def join(self, frame: str, known: tuple[str, ...] = tuple(ANCHORS_M)) -> JoinedModels:
+    def join(
+        self, frame: str, known: tuple[str, ...] = tuple(ANCHORS_M)
+    ) -> tuple[PathOfModel, tuple[ModelVerdict, ...], list[str]]:
+        """Join both, and return the model, the verdicts and the warnings."""
         positions = {name: np.array(ANCHORS_M[name]) for name in known}
         if frame == "first_camera":
             positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
@@ -76,7 +80,8 @@ class Halves:
         arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", None)
         inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, Tape(), None, ())
         survey = Survey().changed({"scale.max_relative_stddev": 0.2})
-        return join_models(SurveyRun(survey, inputs, Journal(SilentProgress())), self.parts)
+        journal = Journal(SilentProgress())
+        return *join_models(SurveyRun(survey, inputs, journal), self.parts), journal.warnings
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
         """Return the largest distance of a photo from the truth after the best similarity (or rigid motion) of all."""
@@ -141,17 +146,17 @@ def of_half(halves: Halves, number: int) -> npt.NDArray[np.bool_]:
 
 def test_halves_of_a_walk_are_where_they_were_if_the_anchors_are_known(exact: Halves) -> None:
     """The anchors are given in the frame of the first photo; the second half treats it as a site frame."""
-    joined = exact.join("first_camera")
-    assert exact.off_m(joined.path.trajectory.centers) < 1e-6
-    assert [verdict.joined_from_sfm is not None for verdict in joined.verdicts] == [True, True]
-    own = [verdict.estimate.value for verdict in joined.verdicts if verdict.estimate is not None]
+    path, verdicts, _ = exact.join("first_camera")
+    assert exact.off_m(path.trajectory.centers) < 1e-6
+    assert [verdict.joined_from_sfm is not None for verdict in verdicts] == [True, True]
+    own = [verdict.estimate.value for verdict in verdicts if verdict.estimate is not None]
     assert own[1] != pytest.approx(own[0], rel=0.1)
-    assert joined.path.sfm.num_reg_images() == NUM_PHOTOS
-    assert joined.path.sfm.is_valid()
-    observations = joined.path.observations
+    assert path.sfm.num_reg_images() == NUM_PHOTOS
+    assert path.sfm.is_valid()
+    observations = path.observations
     assert observations.has_place.all()
     predicted = observations.centers[observations.before == HALF + 3]
-    assert predicted == pytest.approx(np.tile(joined.path.trajectory.centers[HALF + 3], (len(predicted), 1)), abs=1e-9)
+    assert predicted == pytest.approx(np.tile(path.trajectory.centers[HALF + 3], (len(predicted), 1)), abs=1e-9)
 
 
 def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_in_the_end(
@@ -160,32 +165,31 @@ def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_
     noise_m = 0.05 * np.random.default_rng(0).standard_normal(len(exact.log))
     noisy = replace(exact, log=replace(exact.log, range_m=exact.log.range_m + noise_m))
     rough = noisy.with_ranges(np.ones(len(noise_m), dtype=bool))
-    joined = rough.join("unknown")
-    assert joined.notes == ()
+    _, verdicts, warnings = rough.join("unknown")
+    assert warnings == []
     # Places are searched for with a part of the ranges.
     monkeypatch.setattr("rangesfm.estimation.scale.model_placement.ENOUGH_TO_SEARCH", 6)
-    pairs = zip(rough.parts, joined.verdicts, strict=True)
+    pairs = zip(rough.parts, verdicts, strict=True)
     models = [
         ScaledModel(part.trajectory, known(verdict.estimate), is_in_anchor_frame=False) for part, verdict in pairs
     ]
     again = known(place_models(models)[0][1])
-    assert again.scale == pytest.approx(known(joined.verdicts[1].joined_from_sfm).scale, rel=1e-6)
+    assert again.scale == pytest.approx(known(verdicts[1].joined_from_sfm).scale, rel=1e-6)
 
 
 def test_a_half_that_shares_too_few_anchors_is_left_out_and_nothing_invented(exact: Halves) -> None:
     index = exact.log.anchor_ids.index("A1")
     halves = exact.with_ranges(of_half(exact, 0) | (exact.log.anchor_index == index))
-    joined = halves.join("site", ("A1",))
-    first, second = joined.verdicts
+    path, (first, second), _ = halves.join("site", ("A1",))
     assert (first.joined_from_sfm is not None, first.reason) == (True, "")
     assert second.joined_from_sfm is None
     assert "every turn about anchor A1 fits" in second.reason
-    assert joined.path.sfm is halves.parts[0].sfm
+    assert path.sfm is halves.parts[0].sfm
 
 
 def test_a_half_without_ranges_is_left_out_and_one_that_others_join_must_have_some(exact: Halves) -> None:
     num = len(exact.log) // 2
-    second = exact.with_ranges(of_half(exact, 0)).join("unknown").verdicts[1]
+    second = exact.with_ranges(of_half(exact, 0)).join("unknown")[1][1]
     assert second.estimate is None
     assert f"0 of {num} ranges lie on the path" in second.reason
     with pytest.raises(GeometryError, match=f"0 of {num} ranges lie on the path"):

@@ -16,8 +16,8 @@ from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import local_site
+from rangesfm.pipeline.join_models import tie_by_photos
 from rangesfm.pipeline.place_ranges import place_ranges
-from rangesfm.pipeline.tie_models import tie_by_photos
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.sfm.loop_database import LoopMatching
@@ -36,7 +36,9 @@ def run_of(looped: LoopedSurvey, folder: Path) -> SurveyRun:
     inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, Tape(), None, ())
     write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
     changes = {"output.path": folder, "mapper.matching": "sequential", "ranges.time_offset": 0.0}
-    return SurveyRun(Survey().changed(changes), inputs, Journal(SilentProgress()))
+    times = survey.model.timestamps_s
+    of_photos = ImageTimes(tuple(times), np.array(list(times.values())), 0.001, "csv")
+    return SurveyRun(Survey().changed(changes), inputs, Journal(SilentProgress()), of_photos)
 
 
 def models_of(looped: LoopedSurvey, parts: Sequence[Sequence[str]]) -> list[pycolmap.Reconstruction]:
@@ -45,14 +47,9 @@ def models_of(looped: LoopedSurvey, parts: Sequence[Sequence[str]]) -> list[pyco
     return [rescale(without_photos(cut, names.difference(part)), random_similarity(rng)) for part in parts]
 
 
-def times_of(looped: LoopedSurvey) -> ImageTimes:
-    times = looped.survey.model.timestamps_s
-    return ImageTimes(tuple(times), np.array(list(times.values())), 0.001, "csv")
-
-
-def tied(run: SurveyRun, looped: LoopedSurvey, models: list[pycolmap.Reconstruction]) -> list[PathOfModel]:
+def tied(run: SurveyRun, models: list[pycolmap.Reconstruction]) -> list[PathOfModel]:
     with sole_writer(run.survey.output.path):
-        return tie_by_photos(run, place_ranges(run, models, times_of(looped)), times_of(looped))
+        return tie_by_photos(run, place_ranges(run, models))
 
 
 def test_two_laps_that_were_mapped_apart_become_one_model(tmp_path: Path) -> None:
@@ -61,7 +58,7 @@ def test_two_laps_that_were_mapped_apart_become_one_model(tmp_path: Path) -> Non
     run, models = run_of(looped, tmp_path), models_of(looped, [names[:24], names[24:]])
     lens = models[1].camera(1)  # each model has found parameters of its own for the same camera
     lens.params = (1.002 * lens.params).tolist()
-    (path,) = tied(run, looped, models)
+    (path,) = tied(run, models)
     assert path.trajectory.image_names == tuple(names)
     truth_m = looped.survey.model.centers_m
     assert rmse(align_points(path.trajectory.centers, truth_m).apply(path.trajectory.centers) - truth_m) < 0.3
@@ -79,7 +76,7 @@ def test_aisles_that_look_alike_stay_apart(tmp_path: Path, monkeypatch: pytest.M
     looped = survey.looped
     names, run = list(looped.survey.model.timestamps_s), run_of(looped, tmp_path)
     monkeypatch.setattr(LoopMatching, "match", lambda *_: survey.alike)
-    paths = tied(run, looped, models_of(looped, [names[:10], names[-10:]]))
+    paths = tied(run, models_of(looped, [names[:10], names[-10:]]))
     assert [path.trajectory.image_names for path in paths] == [tuple(names[:10]), tuple(names[-10:])]
     (warning,) = run.journal.warnings
     assert "sparse/1 looks like a part of sparse/0, but is none: ranges to A" in warning

@@ -13,7 +13,7 @@ from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
-from rangesfm.pipeline.place_of_result import refuse_to_overwrite
+from rangesfm.pipeline.map_photos import refuse_to_overwrite
 from rangesfm.result.result_folder import RESULT_FILES, new_result, read_result_folder
 from rangesfm.result.result_tables import RESULT_TABLES, RangesAsUsed
 from rangesfm.survey.settings import Survey

@@ -184,7 +184,7 @@ def told(kind: str, seed: int) -> Line:
     except RangesfmError as error:
         return {**line, "refused": str(error)}
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
-    estimate, kept = metric.estimate, metric.kept_refinement is not None
+    estimate, kept = metric.estimate, metric.kept is not None
     positions, lengths = find_kind(estimate.kinds, PositionScale), find_kind(estimate.kinds, LengthScale)
     low, high = estimate.interval_95
     off_m, variances = final_m - survey.true_centers_m, metric.center_covariance_m2
@@ -195,7 +195,7 @@ def told(kind: str, seed: int) -> Line:
         "final_m": rmse(off_m),
         "bent_m": rmse(align_points(final_m, survey.true_centers_m).apply(final_m) - survey.true_centers_m),
         "kept": kept,
-        "why_not": list(metric.why_broken),
+        "why_not": [] if metric.refined is None else list(metric.refined.why_broken),
         "covered": bool(low <= best.scale <= high),
         "half": estimate.uncertainty.half_width_95,
         "scale_stddevs": float(np.log(np.sqrt(low * high) / best.scale) / estimate.uncertainty.empirical),

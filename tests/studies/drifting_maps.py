@@ -123,14 +123,13 @@ def told(survey: MadeSurvey, kind: str, seed: int) -> Line:
     except (GeometryError, SolverError) as error:
         return {**line, "refused": str(error)}
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
-    kept = metric.kept_refinement is not None
-    estimate = metric.estimate
+    estimate, refined = metric.estimate, metric.refined
     # The interval belongs to the delivered map, so the error is that of its scale.
-    delivered = metric.refined_scale if kept else estimate.value
+    delivered = estimate.value if metric.kept is None else metric.kept.scale
     low, high = estimate.interval_95
     variances = metric.center_covariance_m2
     known = np.array([variances[name] for name in metric.trajectory.image_names]) if variances else None
-    refined_m = None if metric.refined is None else metric.trajectory.as_in(metric.refined).centers
+    refined_m = None if refined is None else metric.trajectory.as_in(refined.model).centers
     off_m = final_m - survey.true_centers_m
     return {
         **line,
@@ -138,9 +137,9 @@ def told(survey: MadeSurvey, kind: str, seed: int) -> Line:
         "scaled_m": rmse(scaled_m - survey.true_centers_m),
         "final_m": rmse(off_m),
         "refined_m": None if refined_m is None else rmse(refined_m - survey.true_centers_m),
-        "kept": kept,
-        "why_not": list(metric.why_broken),
-        "log_error": float(np.log((delivered or np.nan) / survey.metres_per_unit)),
+        "kept": metric.kept is not None,
+        "why_not": [] if refined is None else list(refined.why_broken),
+        "log_error": float(np.log(delivered / survey.metres_per_unit)),
         "half_width": estimate.uncertainty.half_width_95,
         "stddev": estimate.uncertainty.empirical,
         "covered": bool(low <= survey.metres_per_unit <= high),

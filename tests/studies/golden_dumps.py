@@ -293,7 +293,7 @@ def covariances_of(metric: MetricResult) -> Values:
         found["covariance placement"] = metric.estimate.placement
     if find_kind(metric.kinds, PositionScale) is not None:
         found["covariance by positions"] = metric.all_measured.posterior.place
-    joint = None if metric.kept_refinement is None else metric.kept_refinement.covariance
+    joint = None if metric.kept is None else metric.kept.summary.covariance
     if joint is not None:
         found |= {
             "covariance similarity": joint.similarity,

@@ -122,10 +122,9 @@ def pairs_of(names: dict[str, list[str]], true_m: dict[str, Array], rng: np.rand
 
 
 def measured_map(metric: MetricResult, markers: dict[str, Marker]) -> MeasuredMap:
-    summary = metric.kept_refinement
-    assert summary is not None
+    assert metric.kept is not None
     anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
-    points = MapPoints(metric.final, anchors_m, markers, summary.pixel_stddev)
+    points = MapPoints(metric.final, anchors_m, markers, metric.kept.summary.pixel_stddev)
     up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
     return MeasuredMap(points, metric.map_errors, metric.estimate.uncertainty.empirical, up)
 
@@ -140,7 +139,7 @@ def told(name: str, seed: int) -> Line:
         metric = run_stages(survey, own_seed)
     except (GeometryError, SolverError) as error:
         return {**line, "refused": str(error)}
-    if metric.kept_refinement is None or metric.map_errors is None:
+    if metric.map_errors is None:
         return {**line, "refused": "no refined map with a covariance"}
     model = truth.model
     markers, true_m = marks_in(truth, rng)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from rangesfm.errors import RangesfmError
 from rangesfm.measurements.ranges.range_log import RangeKind
-from rangesfm.pipeline.map_photos import begin_run, check_taped_ends, checked_keyframes, read_registered
+from rangesfm.pipeline.map_photos import begin_run, check_taped_ends, read_registered, with_keyframes
 from rangesfm.progress import SILENT, Journal
 from rangesfm.sfm.camera import cameras_of_photos, check_camera
 from rangesfm.sfm.features import feature_options
 from rangesfm.sfm.given_database import opened
-from rangesfm.sfm.image_times import ImageTimes, list_images
+from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.matching import matching_options
 from rangesfm.sfm.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.sfm.rigs import read_rigs
@@ -26,6 +26,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.source import is_source, open_source
+from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.clock_times import span_text
 
 # Largest number of photo sizes and of cameras that are listed.
@@ -83,14 +84,15 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         if model is None:
-            keyframes, times = checked_keyframes(run.with_photos(list_images(survey.photos_path), "the folder"))
+            run, keyframes = with_keyframes(run)
         else:
             sfm = read_registered(model, journal)
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
             keyframes = tuple(image.name for image in sfm.images.values())
-            times = times_of_model(survey, sfm, model) if inputs.needs_times else None
+            if inputs.needs_times:
+                run = replace(run, times=times_of_model(survey, sfm, model))
             check_taped_ends(run.with_photos(keyframes, "the map"), keyframes)
-        _tell_of_times(survey, inputs, keyframes, times, checked)
+        _tell_of_times(run, len(keyframes), checked)
         if photos is not None:
             _check_mapper(survey, photos.subset(keyframes), checked)
     return checked
@@ -190,21 +192,19 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
         yield f"reference: {len(inputs.reference)} positions{name}, only for comparison"
 
 
-def _tell_of_times(
-    survey: Survey, inputs: RangingInputs, keyframes: Sequence[str], times: ImageTimes | None, checked: CheckedSurvey
-) -> None:
-    radio_s = inputs.log.timestamp_s
+def _tell_of_times(run: SurveyRun, num_keyframes: int, checked: CheckedSurvey) -> None:
+    radio_s, times = run.inputs.log.timestamp_s, run.times
     if times is not None and radio_s is None:
         first_s, last_s = times.timestamps_s[[0, -1]]
-        checked.facts.append(f"times: {len(keyframes)} keyframes from {span_text(first_s, last_s)} ({times.source})")
+        checked.facts.append(f"times: {num_keyframes} keyframes from {span_text(first_s, last_s)} ({times.source})")
         return
     if times is None or radio_s is None:
-        why = "the ranges name their photos" if len(inputs.log) else "there are no ranges"
-        checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, {why}")
+        why = "the ranges name their photos" if len(run.inputs.log) else "there are no ranges"
+        checked.facts.append(f"times: none are needed for {num_keyframes} keyframes, {why}")
         return
-    photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
+    photos_s, offset_s = times.timestamps_s, run.survey.ranges.time_offset_s
     checked.facts.append(
-        f"times: {len(keyframes)} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
+        f"times: {num_keyframes} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
         f"ranges from {span_text(radio_s.min(), radio_s.max())}"
     )
     at_s = radio_s + (offset_s or 0.0)

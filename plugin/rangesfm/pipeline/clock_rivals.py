@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.positions.clock import POSITIONS
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
+from rangesfm.measurements.ranges.clock.time_offset import REMEDY
 from rangesfm.pipeline.metric_result import Rivals
-from rangesfm.survey.survey_run import Clock, PathOfModel, SurveyRun
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -20,20 +25,45 @@ _HARDLY_LIKELY = 0.05
 
 
 def by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Rivals:
-    """Return what other likely time offsets of all clocks would change.
+    """Return what other likely time offsets would change, of the clock of the ranges and of that of the positions.
 
     Raises:
         GeometryError: as for ``scale_by_rivals``.
     """
-    found = [scale_by_rivals(estimate, path.trajectory, clock) for clock in run.clocks(path)]
+    offset, track, trajectory = path.time_offset, run.inputs.positions.antenna, path.trajectory
+
+    def at_ranges_offset(other: TimeOffset) -> ScaleEstimate:
+        observations = run.ranges_on(trajectory, replace(path, time_offset=other).offset_s)
+        return run.estimate_scale(replace(path, observations=observations))
+
+    def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
+        antenna = track and replace(track, offset_s=other.value_s)
+        positions = replace(run.inputs.positions, antenna=antenna)
+        return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path)
+
+    found = list[Rivals]()
+    if offset is not None and offset.rivals:
+        found.append(scale_by_rivals(estimate, trajectory, offset, at_ranges_offset, "", REMEDY))
+    if track is not None and (search := track.search) is not None and search.rivals:
+        remedy = POSITIONS.remedy
+        found.append(scale_by_rivals(estimate, trajectory, search, at_positions_offset, " of the positions", remedy))
     return Rivals(sum((each.doubts for each in found), ()), math.hypot(*(each.stddev for each in found)))
 
 
-def scale_by_rivals(estimate: ScaleEstimate, path: Trajectory, clock: Clock) -> Rivals:
-    """Estimate the scale for every other likely time offset.
+def scale_by_rivals(
+    estimate: ScaleEstimate,
+    path: Trajectory,
+    offset: TimeOffset,
+    estimate_at: Callable[[TimeOffset], ScaleEstimate],
+    whose: str,
+    remedy: str,
+) -> Rivals:
+    """Estimate the scale for every other likely time offset of a clock.
 
     Args:
-        estimate: at this offset. path: of the unscaled model. clock: with its rivals.
+        estimate: at this offset. path: of the unscaled model. offset: with its rivals.
+        estimate_at: returns the estimate at another offset, or raises GeometryError.
+        whose: the clock is, in words. remedy: what the user can do.
 
     Returns:
         Doubts in words, and the relative stddev of the scale that comes from the choice among the offsets: the larger
@@ -43,12 +73,11 @@ def scale_by_rivals(estimate: ScaleEstimate, path: Trajectory, clock: Clock) -> 
     Raises:
         GeometryError: a very different scale follows from other offsets, and they are not unlikely.
     """
-    doubts, far_apart, offset, whose = [], [], clock.offset, clock.whose
-    far_probability, variance, farthest = 0.0, 0.0, 0.0
+    doubts, far_apart, far_probability, variance, farthest = list[str](), list[str](), 0.0, 0.0, 0.0
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
         try:
-            other = clock.estimate_at(offset.of_rival(rival))
+            other = estimate_at(offset.of_rival(rival))
         except GeometryError:
             doubts.append(f"the time offset{whose} may also be {said}, which gives no scale")
             continue
@@ -68,6 +97,6 @@ def scale_by_rivals(estimate: ScaleEstimate, path: Trajectory, clock: Clock) -> 
         raise GeometryError(
             f"the motion does not determine the time offset{whose}, nor the scale that depends on it: "
             f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {estimate.value:.6g} m per unit, "
-            f"{', '.join(far_apart)}: {clock.remedy}"
+            f"{', '.join(far_apart)}: {remedy}"
         )
     return Rivals(tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95))

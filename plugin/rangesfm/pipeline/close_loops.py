@@ -1,46 +1,75 @@
-"""Closing of loops by the options of a survey: the refined map proposes pairs, which are matched, tested and used."""
+"""Closing of loops: the map at rest proposes pairs of photos, which are matched, tested and used, in rounds.
+
+A refined map has its metres from any kind of measurement. The model of a mapper is in any unit, and closes its loops by
+its photos alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import pycolmap
 
-from rangesfm.errors import InputError
+from rangesfm.colmap.colmap_log import colmap_log
+from rangesfm.colmap.model_files import write_binary_model
+from rangesfm.colmap.reprojection import point_errors
+from rangesfm.errors import GeometryError, InputError, SolverError
+from rangesfm.estimation.map_problem import MapProblem
+from rangesfm.estimation.photo_bending import LARGEST_FACTOR
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.pipeline.judge_map import moved_to_estimate
-from rangesfm.pipeline.loop_matching import loop_matching
-from rangesfm.pipeline.matched_map import MatchedMap, MergeTracks
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.refine_map import RefinedMap
+from rangesfm.pipeline.refine_map import MergeTracks, refine_closed_map
+from rangesfm.progress import Journal, Progress
+from rangesfm.result.result_folder import RESULT_NAMES
+from rangesfm.sfm.loop_database import LoopMatching, Pair, has_closed_loops
 from rangesfm.sfm.loops.loop_closure import LoopClosure
-from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds
+from rangesfm.sfm.loops.loop_finder import LoopFinder
+from rangesfm.sfm.loops.merge import merge_tracks
+from rangesfm.sfm.loops.resection import Loop
+from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds, find_in
+from rangesfm.sfm.matching import matching_options
+from rangesfm.sfm.photos_alike import pairs_alike
+from rangesfm.sfm.steps import DATABASE_NAME, MODELS_NAME, Workspace
+from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.util.files.output_folder import sole_writer
-from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.files.output_folder import OutputFolder, sole_writer
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
-Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap | None]
-"""Closes loops of a map and refines it again; None if they are closed in it."""
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
-def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -> MetricResult:
+def loop_matching(survey: Survey, progress: Progress, output: OutputFolder) -> LoopMatching | None:
+    """Return the matching of pairs that may be loops; None where loops are not to be closed."""
+    is_given = survey.images.model is not None
+    source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
+    if not survey.mapper.close_loops or source is None or not source.is_file():
+        return None
+    with pycolmap.Database.open(source) as database:
+        num_photos = database.num_images()
+    options = matching_options(survey.mapper, num_photos, survey.output.seed)
+    return LoopMatching(source, options, progress, output) if is_given or options.is_in_time_only else None
+
+
+def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
     """Return a refined map with its loops closed; the same map where they are not to be closed.
-
-    Args:
-        run: the survey. refine: closes loops and refines the map again.
 
     Raises:
         InputError: the given database does not belong to the given model.
     """
-    metric = refined.metric
-    if not run.survey.mapper.close_loops or metric.kept_refinement is None:
+    if not run.survey.mapper.close_loops or metric.kept is None:
         return metric
     with sole_writer(run.survey.output.path) as output:
         if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return metric
-        if metric.map_errors is None:
+        if metric.kept.errors is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return metric
         if why_not := matching.why_unfit(metric.final):
@@ -48,63 +77,205 @@ def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -
             if run.survey.images.model is not None:
                 raise InputError(why_not, run.survey.mapper.database_path)
             return metric
-        metric_map, seed = _MetricMap(run, refined, refine), run.survey.output.seed
-        last, tried = close_in_rounds(MatchedMap(metric_map, matching, run.journal, seed, asks_vocabulary=False))
+        last, tried = close_in_rounds(_MetricMap(run.survey, run.journal, matching, run, metric))
         last.keep(tried)
         matching.publish(output)
-        return _told(run, metric, last.map.refined.metric, tried)
+        closed, contradicted = (
+            tuple((last.model.image(first).name, last.model.image(second).name) for first, second in sorted(pairs))
+            for pairs in (tried.closed, tried.contradicted)
+        )
+        before, after = metric.kept, last.metric.refined
+        assert after is not None, "a refined map"
+        # The map before is compared as it would be the result.
+        path = metric.trajectory.as_in(moved_to_estimate(before, metric.trajectory).model) if closed else None
+        loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path)
+        run.journal.warn(*filter(None, [loops.warning]))
+        # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
+        summary = replace(after.summary, bend_m=before.summary.bend_m)
+        return replace(last.metric, refined=replace(after, summary=summary, loops=loops))
+
+
+def close_loops_of_models(
+    survey: Survey, models: Sequence[pycolmap.Reconstruction], journal: Journal
+) -> pycolmap.Reconstruction:
+    """Close the loops of the largest model of a reconstruction, in its place, and return the model.
+
+    Where they are not to be closed, or an earlier run has closed them, the model stays as it is. Results that were made
+    from the model before are removed.
+
+    Args:
+        models: of the output folder, which has their database and record.
+    """
+    with sole_writer(survey.output.path) as output:
+        if has_closed_loops(Workspace(output.path, journal.progress)):
+            return models[0]
+        if (matching := loop_matching(survey, journal.progress, output)) is None:
+            return models[0]
+        try:
+            if why_not := matching.why_unfit(models[0]):
+                raise GeometryError(why_not)
+            with journal.stage("refinement"):
+                path = trajectory_from_reconstruction(models[0])
+                at_rest = refine(_problem(survey, path, models[0], is_refined=False), {})
+            start = _UnscaledMap(survey, journal, matching, path, at_rest)
+            if start.finder is None:
+                raise GeometryError("the covariance of the poses is not known")
+            last, tried = close_in_rounds(start)
+        except (GeometryError, SolverError) as error:
+            journal.warn(f"loops are not closed: {error}")
+            matching.discard()
+            return models[0]
+        last.keep(tried)
+        matching.keep_closed()
+        wrong = f"; {len(tried.contradicted)} contradict the model and were not used" if tried.contradicted else ""
+        journal.progress.message(
+            f"loops: {len(tried.proposed)} pairs of photos may show the same place; {len(tried.verified)} of them "
+            f"match; {len(tried.closed)} were used to close loops{wrong}"
+        )
+        if not tried.closed:
+            matching.publish_with(output)
+            return models[0]
+        places, staged = output.path / MODELS_NAME, matching.folder / MODELS_NAME
+        shutil.copytree(places, staged, dirs_exist_ok=True, ignore=lambda *_: ["0"])
+        (staged / "0").mkdir(exist_ok=True)
+        write_binary_model(last.model, staged / "0")
+        matching.publish_with(output, {places: staged}, [output.path / name for name in RESULT_NAMES])
+        return last.model
 
 
 @dataclass(frozen=True)
-class _MetricMap:
-    """A refined map of a survey, as one whose loops can be closed."""
+class _MatchedMap(ABC):
+    """A map at rest with the matching of its photos."""
+
+    survey: Survey
+    journal: Journal
+    matching: LoopMatching
+
+    @property
+    @abstractmethod
+    def model(self) -> pycolmap.Reconstruction:
+        """The map."""
+
+    @property
+    @abstractmethod
+    def finder(self) -> LoopFinder | None:
+        """Of its loops; None if the errors of its poses are not known."""
+
+    @property
+    @abstractmethod
+    def why_broken(self) -> tuple[str, ...]:
+        """What shows that the map is broken; empty if nothing does."""
+
+    @abstractmethod
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> Self | None:
+        """Return the map refined with loops, relative poses by ids of frames; None if they are closed in it."""
+
+    def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
+        """Return pairs of photos that look alike; arguments as of ``find_in``."""
+        del known
+        return []
+
+    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
+        if self.finder is None:
+            return [], tried
+        with self.journal.stage("loops"):
+            return find_in(self.finder, self.matching.match, self.matching.known(), tried, self.alike)
+
+    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> Self | None:
+        self.keep(tried)
+        assert self.finder is not None, "it has found the loops"
+
+        def merge(model: pycolmap.Reconstruction) -> None:
+            with colmap_log(self.matching.log):
+                merge_tracks(model, self.matching.database, seed=self.survey.output.seed)
+
+        with self.journal.stage("refinement"):
+            closed = self.with_loops(self.finder.relative_poses(loops), merge)
+        if closed is not None and (why := closed.why_broken):
+            self.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
+            return None
+        return closed
+
+    def keep(self, tried: TriedPairs) -> None:
+        """Keep the matches of closed loops alone in the database, and what was tried in vain."""
+        self.matching.keep(tried.proposed, tried.verified, tried.closed)
+
+
+@dataclass(frozen=True)
+class _MetricMap(_MatchedMap):
+    """A refined map of a survey."""
 
     run: SurveyRun
-    refined: RefinedMap
-    refine: Refine
+    metric: MetricResult
 
     @property
     def model(self) -> pycolmap.Reconstruction:
-        return self.refined.metric.final
+        return self.metric.final
 
-    @property
-    def trajectory(self) -> Trajectory:
-        return self.refined.metric.trajectory
-
-    @property
-    def errors(self) -> MapErrors | None:
-        return self.refined.metric.map_errors
-
-    @property
-    def pixel_stddev(self) -> float:
-        return self.refined.at_rest.pixel_stddev
+    @cached_property
+    def finder(self) -> LoopFinder | None:
+        refined, path = self.metric.kept, self.metric.trajectory
+        if refined is None or refined.errors is None:
+            return None
+        seed = self.survey.output.seed
+        return LoopFinder.in_refined_map(refined.model, path, refined.errors, refined.summary.pixel_stddev, seed)
 
     @property
     def why_broken(self) -> tuple[str, ...]:
-        return self.refined.metric.why_broken
+        return () if self.metric.refined is None else self.metric.refined.why_broken
 
     def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _MetricMap | None:
-        closed = self.refine(self.run, self.refined, loops, merge)
-        return None if closed is None else replace(self, refined=closed)
+        closed = refine_closed_map(self.run, self.metric, loops, merge)
+        return None if closed is None else replace(self, metric=closed)
 
 
-def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: TriedPairs) -> MetricResult:
-    """Return the last map with what became of its loops, of which the journal is told."""
-    closed, contradicted = (
-        tuple((after.final.image(first).name, after.final.image(second).name) for first, second in sorted(pairs))
-        for pairs in (tried.closed, tried.contradicted)
+@dataclass(frozen=True)
+class _UnscaledMap(_MatchedMap):
+    """The model of a mapper, whose photos are matched as far as they look alike, too.
+
+    Attributes:
+        trajectory: of its keyframes. at_rest: the model, with no measurements but its photos.
+    """
+
+    trajectory: Trajectory
+    at_rest: MapAtRest
+
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        return self.at_rest.problem.metric
+
+    @cached_property
+    def finder(self) -> LoopFinder | None:
+        # The map is bent as much as photos usually bend maps, since nothing tells how much.
+        found, at_rest, seed = joint_errors(self.at_rest, LARGEST_FACTOR), self.at_rest, self.survey.output.seed
+        if found is None:
+            return None
+        return LoopFinder.in_refined_map(self.model, self.trajectory, found.errors, at_rest.pixel_stddev, seed)
+
+    @property
+    def why_broken(self) -> tuple[str, ...]:
+        errors = point_errors(self.model)
+        return () if errors.fit else (errors.apart("the refined map"),)
+
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _UnscaledMap | None:
+        problem = _problem(self.survey, self.trajectory, self.model, is_refined=True)
+        rest = refine_with_loops(problem, problem, {}, loops, merge)
+        return None if rest is None else replace(self, at_rest=rest)
+
+    def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
+        matching = self.matching
+        return pairs_alike(matching.database, known, matching.log, max_num=1, seed=self.survey.output.seed)
+
+
+def _problem(survey: Survey, path: Trajectory, model: pycolmap.Reconstruction, *, is_refined: bool) -> MapProblem:
+    return MapProblem(
+        pycolmap.Reconstruction(model),
+        (),
+        path.frame_ids,
+        survey.camera,
+        survey.refine,
+        first_pose_is_fixed=True,
+        is_placed=False,
+        num_threads=survey.mapper.num_threads,
+        is_refined=is_refined,
     )
-    path_before = _delivered(before) if closed else None
-    loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path_before)
-    run.journal.warn(*filter(None, [loops.warning]))
-    if before.refinement is None or after.refinement is None:
-        return replace(after, loops=loops)
-    # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
-    return replace(after, loops=loops, refinement=replace(after.refinement, bend_m=before.refinement.bend_m))
-
-
-def _delivered(metric: MetricResult) -> Trajectory:
-    """Return the path of a refined map as it would be the result: bent and moved to its best estimate."""
-    if metric.at_refined is not None and metric.kept_refinement is not None:
-        metric = moved_to_estimate(metric, metric.at_refined)
-    return metric.trajectory.as_in(metric.final)

@@ -19,6 +19,7 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_f
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.anchors.site import local_site
 from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.run import map_in_metres, with_results
@@ -231,7 +232,8 @@ def paths_of_surveys(
         placed = associate(log, survey.path, tags_in_cam_m, options=survey.result.summary.settings.ranges.association)
         status = np.where(placed.has_place & (number != k), RangeStatus.OUTSIDE_PATH, placed.status).astype(np.int8)
         status[(status == RangeStatus.USED) & is_check] = RangeStatus.CHECK
-        paths.append(PathOfModel(survey.name, survey.model, survey.path, replace(placed, status=status)))
+        placed = replace(placed, status=status)
+        paths.append(PathOfModel(survey.name, survey.model, survey.path, placed, TimeOffset.given(0.0)))
     return paths
 
 

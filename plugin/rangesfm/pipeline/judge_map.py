@@ -22,10 +22,11 @@ from rangesfm.estimation.scale.scale_verdict import refuse_unknown
 from rangesfm.measurements.joint_map import Doubt, JointMap
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
-from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:
@@ -36,45 +37,41 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     Raises:
         GeometryError: the scale is less certain than asked for.
     """
-    survey, journal = run.survey, run.journal
-    metric, on_map = _estimated(survey, metric), metric.all_measured
-    path, bends_m = metric.trajectory.as_in(metric.final), [each.bends_m(on_map) for each in on_map.kinds]
+    journal, metric = run.journal, _estimated(run.survey, metric)
+    on_map, path = metric.all_measured, metric.trajectory.as_in(metric.final)
+    bends_m = [each.bends_m(on_map) for each in on_map.kinds]
     bent_by_m = next((each for each in bends_m if len(each)), np.zeros(0))
     diagnosis = _tested(run, metric, path.centers, bent_by_m)
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
     doubts: list[Doubt] = []
-    if metric.why_broken:
-        reason = f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.why_broken)}"
+    if metric.refined is not None and metric.refined.why_broken:
+        reason = (
+            f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.refined.why_broken)}"
+        )
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
-    doubts += doubts_of_map(metric.kept_refinement, point_errors(metric.final))
+    refinement = None if metric.kept is None else metric.kept.summary
+    doubts += doubts_of_map(refinement, point_errors(metric.final))
     advice = "let the offset be searched for ([positions] time_offset)"
     doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
+    # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
     of_clocks = (*metric.positions.doubts_of_found_clock(), *metric.rivals.doubts)
     journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *of_clocks)
     doubts += known_doubts
-    against = (
-        *(doubt.reason for doubt in of_lens),
-        *diagnosis.of_place,
-        *of_clocks,
-        *(doubt.reason for doubt in doubts),
-    )
-    place = place_of_map(metric.estimate, metric.kept_refinement, path, against, bent_by_m)
-    judged = replace(metric, place=place, diagnosis=diagnosis).doubted(metric.rivals.doubts)
-    judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
-    # A lens that does not fit comes first, because it may look like other mistakes.
-    judged = judged.doubted(diagnosis.reasons)
-    return judged.doubted([doubt.reason for doubt in of_lens], [doubt.advice for doubt in of_lens])
+    of_map = [doubt.reason for doubt in doubts]
+    against = (*(doubt.reason for doubt in of_lens), *diagnosis.of_place, *of_clocks, *of_map)
+    place = place_of_map(metric.estimate, refinement, path, against, bent_by_m)
+    judged = replace(metric, place=place, diagnosis=diagnosis)
+    return judged.doubted(*of_lens, *map(Doubt, diagnosis.reasons), *doubts, *map(Doubt, metric.rivals.doubts))
 
 
 def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     """Return a doubt if the photos fit far better with another camera model, and lengths change with it."""
     if not metric.final.num_points3D():
         return ()
-    estimate, refinement = metric.estimate, metric.kept_refinement
     is_learnt = any(each.shows_bending for each in metric.kinds)
-    factor = refinement.bending_factor if refinement is not None and is_learnt else None
-    half_width_95 = estimate.uncertainty.half_width_95
+    factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else None
+    half_width_95 = metric.estimate.uncertainty.half_width_95
     doubt = doubt_of_lens(fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE)), factor, half_width_95)
     return () if doubt is None else (doubt,)
 
@@ -104,17 +101,21 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
     return diagnosis
 
 
-def moved_to_estimate(metric: MetricResult, at: JointMap) -> MetricResult:
-    """Return the result with the refined map bent and moved as a whole to its best estimate."""
-    refinement, bent = metric.kept_refinement, likely_bend(at, metric.trajectory)
-    assert metric.refined is not None, "a refined map"
-    assert refinement is not None, "a refined map"
+def moved_to_estimate(refined: RefinedMap, unscaled: Trajectory) -> RefinedMap:
+    """Return a refined map bent and moved as a whole to its best estimate; one that is not known stays as it is.
+
+    Args:
+        unscaled: path of the unscaled model.
+    """
+    at, summary = refined.on_map, refined.summary
+    if not at.is_at_rest:
+        return refined
+    bent, model = likely_bend(at, unscaled), pycolmap.Reconstruction(refined.model)
     for moved in (moved for each in at.kinds for moved in each.moved_ranges(at.posterior, bent)):
-        refinement = refinement.moved(at.estimate, *moved)
-    refined = pycolmap.Reconstruction(metric.refined)
+        summary = summary.moved(at.estimate, *moved)
     if len(bent.frame_ids):
-        bend(refined, bent)
-    return replace(metric, refined=rescale(refined, at.estimate), refinement=refinement)
+        bend(model, bent)
+    return replace(refined, model=rescale(model, at.estimate), summary=summary)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
@@ -123,18 +124,17 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
     Raises:
         GeometryError: the scale is less certain than asked for.
     """
-    start, at = metric.estimate, metric.all_measured
+    estimate, at = metric.estimate, metric.all_measured
     try:
         if at.is_at_rest:
-            estimate, metric = start.at_rest(at, survey.scale), moved_to_estimate(metric, at)
-        else:
-            if start.method != "two-candidate":  # which has no interval
-                refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
-            estimate = start
-            if metric.kept_refinement is not None and metric.refined_scale is not None:
-                estimate = replace(start, value=metric.refined_scale)
+            estimate = estimate.at_rest(at, survey.scale)
+        elif estimate.method != "two-candidate":  # which has no interval
+            refuse_unknown(estimate.uncertainty.half_width_95, estimate.reasons, estimate.advice, survey.scale)
     except GeometryError as error:
         raise with_cause(error, at) from None
+    if (kept := metric.kept) is not None:
+        metric = replace(metric, refined=moved_to_estimate(kept, metric.trajectory))
+        estimate = estimate if at.is_at_rest else replace(estimate, value=kept.scale)
     if metric.rivals.doubts:
         estimate = replace(estimate, uncertainty=estimate.uncertainty.beside(CLOCKS, metric.rivals.stddev))
     return replace(metric, estimate=estimate)

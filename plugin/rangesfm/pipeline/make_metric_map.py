@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import LoosePiece, loose_pieces
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_pieces
-from rangesfm.errors import GeometryError
+from rangesfm.errors import GeometryError, number_text
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
+from rangesfm.measurements.joint_map import Doubt
 from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.clock_rivals import by_rivals
 from rangesfm.pipeline.close_loops import close_loops_of_survey
-from rangesfm.pipeline.join_models import ModelVerdict, join_models
 from rangesfm.pipeline.judge_map import judge_map, with_cause
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.refine_map import refine_closed_map, refine_map, with_anchors_on_likelier_sides
+from rangesfm.pipeline.refine_map import refine_map, with_anchors_on_likelier_sides
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.kinds_in_map import ranges_in_map, without_contradicted
 from rangesfm.survey.settings import Survey
@@ -27,34 +28,6 @@ from rangesfm.util.geometry.numerics import NOTHING_KNOWN
 from rangesfm.util.geometry.poses import model_poses
 
 _ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusal
-
-
-def join_by_survey(
-    run: SurveyRun, paths: Sequence[PathOfModel], *, must_join: bool
-) -> tuple[PathOfModel, tuple[ModelVerdict, ...]]:
-    """Join the models to the first one; models that cannot be joined are left out with a warning.
-
-    Args:
-        run: survey of the models.
-        paths: models with the ranges on their paths.
-        must_join: whether it is an error if no other model can be joined.
-
-    Returns:
-        The joined model, and the verdicts on all models (none where there is only one).
-
-    Raises:
-        GeometryError: no other model can be joined, and ``must_join`` is true.
-    """
-    if len(paths) == 1:
-        return paths[0], ()
-    joined = join_models(run, paths)
-    left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
-    if must_join and len(left_out) == len(paths) - 1:
-        reasons = "; ".join(f"{model.name}: {model.reason}" for model in left_out)
-        raise GeometryError(f"nothing can be joined to {paths[0].name}: {reasons}")
-    whose = (f"{model.name} ({model.num_images} photos) is left out: {model.reason}" for model in left_out)
-    run.journal.warn(*joined.notes, *whose)
-    return joined.path, joined.verdicts
 
 
 def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResult:
@@ -69,12 +42,11 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         metric = scale_by_survey(run, path, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
-            refined = with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
-        metric = close_loops_of_survey(run, refined, refine_closed_map)
-        if pieces and metric.loops is not None and metric.loops.closed:  # loops hold pieces that neighbours do not
-            pieces = _pieces_not_held(
-                run, replace(path, sfm=metric.final, trajectory=path.trajectory.as_in(metric.final))
-            )
+            metric = with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
+        metric = close_loops_of_survey(run, metric)
+        loops, final = None if metric.kept is None else metric.kept.loops, metric.final
+        if pieces and loops is not None and loops.closed:  # loops hold pieces that neighbours do not
+            pieces = _pieces_not_held(run, replace(path, sfm=final, trajectory=path.trajectory.as_in(final)))
     of_pieces = doubts_of_pieces(pieces, path.sfm.num_reg_images())
     run.journal.warn(*(doubt.reason for doubt in of_pieces))
     with run.journal.stage("judgement"):
@@ -120,12 +92,9 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     ranges = ranges_in_map(inputs, estimate, path.trajectory, survey.refine)
     predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
-    offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     kept = without_contradicted(inputs, estimate.kinds)
-    return MetricResult(
-        path.trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=kept.tape,
-        positions=kept.positions, rivals=by_rivals(run, path, estimate),
-    )  # fmt: skip
+    rivals = by_rivals(run, path, estimate)
+    return MetricResult(path, estimate, scaled, predicted, weights, kept.tape, kept.positions, rivals)
 
 
 def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:
@@ -141,3 +110,48 @@ def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel)
     except (GeometryError, np.linalg.LinAlgError):
         return error
     return with_cause(error, estimate.on_map)
+
+
+def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> tuple[SurveyRun, MetricResult]:
+    """Correct the likeliest mistake and make the map again; return the run and the map unchanged if none was found.
+
+    The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
+    apart the likelier one is corrected, too; the user has asked for it and is told.
+    """
+    if not metric.diagnosis.causes:
+        return run, metric
+    if metric.models:
+        run.journal.warn("no mistake is corrected: the map is joined from several models")
+        return run, metric
+    cause, rows = metric.diagnosis.causes[0], metric.diagnosis.rows
+    inputs, log, correction = run.inputs, run.inputs.log, cause.correction
+    known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
+    anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
+    moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in log.tag_ids]).reshape(-1, 3)
+    if correction.longer_m is not None:
+        log = replace(log, range_m=log.range_m - _spread(correction.longer_m, rows, len(log)))
+    inputs = replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
+    corrected = replace(run, inputs=inputs)
+    try:
+        shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(log))
+        observations = corrected.ranges_on(metric.trajectory, shift_s + metric.path.offset_s)
+        if correction.left_out is not None:
+            status = observations.status.copy()
+            status[rows[correction.left_out]] = RangeStatus.CHECK
+            observations = replace(observations, status=status)
+        path = replace(metric.path, observations=observations)
+        adopted = metric_map(corrected, path, refine=metric.refined is not None)
+    except GeometryError as error:
+        run.journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
+        return run, metric
+    change = number_text(100 * (adopted.estimate.value / metric.estimate.value - 1), "+.2f")
+    said = f"adopted: {cause.words}; the scale changed by {change} %, from {metric.estimate.value:.6g}"
+    run.journal.warn(said)
+    return corrected, adopted.doubted(Doubt(said))
+
+
+def _spread(values: Array, rows: Indices, num: int) -> Array:
+    """Return an array (num,) with the values (k,) at the given rows (k,), and 0 elsewhere."""
+    spread = np.zeros(num)
+    spread[rows] = values
+    return spread

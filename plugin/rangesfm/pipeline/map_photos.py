@@ -1,4 +1,4 @@
-"""Mapping of photos to unscaled models by the options of a survey, with checks before the long work."""
+"""The photos of a survey and their mapping to unscaled models, with checks before the long work."""
 
 from __future__ import annotations
 
@@ -24,26 +24,51 @@ from rangesfm.diagnostics.preflight import (
     notes_on_times,
 )
 from rangesfm.errors import InputError
-from rangesfm.export import check_formats
+from rangesfm.export import EXPORTED_NAMES, OFFSET_NAME, check_formats
 from rangesfm.measurements.lengths.locate_lengths import check_ends
-from rangesfm.pipeline.place_of_result import refuse_to_overwrite
 from rangesfm.pipeline.place_ranges import check_times
 from rangesfm.progress import Journal
-from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos
+from rangesfm.result.result_folder import PHOTOS_NAMES, RESULT_NAMES, places_for_photos
 from rangesfm.sfm.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.sfm.keyframes import select_keyframes
 from rangesfm.sfm.mapping import pipeline_options
 from rangesfm.sfm.reconstruct import reconstruct_in
 from rangesfm.sfm.rigs import read_rigs
+from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
 from rangesfm.sfm.tags import find_tags
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.survey.sources.source import is_source
+from rangesfm.survey.survey_reader import input_paths
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.folders import real_path
 from rangesfm.util.geometry.trajectory import Trajectory
+
+
+def result_names(survey: Survey) -> set[str]:
+    """Return the names that a result of this survey takes in the output folder, export formats included."""
+    return {*RESULT_NAMES, OFFSET_NAME}.union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
+
+
+def refuse_to_overwrite(survey: Survey) -> None:
+    """Check that the results will overwrite no input, and will not be written among the files of an input folder.
+
+    Raises:
+        InputError: they would; it names the input.
+    """
+    folder = real_path(survey.output.path)
+    maps = survey.images.model is None
+    places = {folder / name for name in result_names(survey)}
+    places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
+    for _, _, given in input_paths(survey):
+        path = real_path(given)
+        if not places.isdisjoint((path, *path.parents)):
+            raise InputError("the results would overwrite this input, expected another output path", given)
+        if path.is_dir() and path == folder:
+            raise InputError("the results would be written into this input, expected another output path", given)
 
 
 def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
@@ -63,19 +88,19 @@ def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
     return SurveyRun(survey, inputs, journal)
 
 
-def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | None]:
-    """Return the keyframes and their times, after checking that these fit those of ranges and reference.
+def with_keyframes(run: SurveyRun) -> tuple[SurveyRun, tuple[str, ...]]:
+    """Return the survey with the times of its keyframes, and these, after checks that they fit ranges and reference.
 
     Raises:
         InputError: they do not.
     """
+    run = run.with_photos(photos := list_images(run.survey.photos_path), "the folder")
     keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=not run.inputs.needs_times)
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
     check_times(run, nowhere)
-    check_taped_ends(run, keyframes if run.survey.images.rig_config is None else list_images(run.survey.photos_path))
-    tell_of_times(run, times)
-    return keyframes, times
+    check_taped_ends(run, keyframes if run.survey.images.rig_config is None else photos)
+    return with_times(run, times), keyframes
 
 
 def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
@@ -84,16 +109,19 @@ def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
     check_ends(run.inputs.tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
 
 
-def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
-    """Warn of oddities in the times of the photos, and in both clocks if no time offset is given."""
+def with_times(run: SurveyRun, times: ImageTimes | None) -> SurveyRun:
+    """Return the survey with the times of its photos, after warnings of their oddities.
+
+    The warnings are of both clocks if no time offset is given.
+    """
     radio_s, options = run.inputs.log.timestamp_s, run.survey.ranges
-    if times is None or radio_s is None:
-        return
-    run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
-    at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
-    run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
-    if not is_given:
-        run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
+    if times is not None and radio_s is not None:
+        run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
+        at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
+        run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
+        if not is_given:
+            run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
+    return replace(run, times=times)
 
 
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,21 +12,20 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import Place
-from rangesfm.estimation.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, upward_by
+from rangesfm.measurements.kind import Measurements
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.pipeline.join_models import ModelVerdict
 from rangesfm.sfm.loops.loop_closure import LoopClosure
+from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.similarity import Similarity, align_points
+from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -43,7 +41,51 @@ class Rivals(NamedTuple):
     stddev: float
 
 
-NO_RIVALS = Rivals((), 0.0)
+@dataclass(frozen=True)
+class ModelVerdict:
+    """Outcome for one of the models that were to be joined.
+
+    Attributes:
+        name: name for the user, such as "sparse/0".
+        estimate: estimate of its scale by its own ranges; None if they do not determine it.
+        joined_from_sfm: transformation from its unscaled world to that of the joined unscaled model; None if the model
+            is left out.
+        reason: why it is left out; empty if it is not.
+    """
+
+    name: str
+    num_images: int
+    estimate: ScaleEstimate | None
+    joined_from_sfm: Similarity | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class RefinedMap:
+    """A refined map.
+
+    Attributes:
+        model: the map. summary: of its refinement.
+        kinds: the measurements of the refinement, with their noise at rest.
+        on_map: all that is measured in the map at rest, before it is moved to its estimate; the map before the
+            refinement, without kinds, where nothing is known of the scale's error.
+        scale: metres per SfM unit: at the estimate of all that is measured, or of a broken map its own.
+        why_broken: reasons why it cannot be right; empty if there are none.
+        loops: those that were closed in it; None where none were looked for.
+    """
+
+    model: pycolmap.Reconstruction
+    summary: RefineSummary
+    kinds: tuple[Measurements, ...]
+    on_map: JointMap
+    scale: float
+    why_broken: tuple[str, ...] = ()
+    loops: LoopClosure | None = None
+
+    @property
+    def errors(self) -> MapErrors | None:
+        """How the parts of the map err together; None if that is not known."""
+        return None if self.summary.covariance is None else self.summary.covariance.errors
 
 
 @dataclass(frozen=True)
@@ -51,57 +93,48 @@ class MetricResult:
     """A scaled and perhaps refined map with its ranges. The log has n ranges.
 
     Attributes:
-        trajectory: keyframes of the unscaled model.
-        time_offset: estimate of the time offset; None where it was given or is not needed.
-        time_offset_s: time offset used, image time minus range time; None where the log names photos.
+        path: the unscaled model with its path and the ranges on it.
         estimate: of the scale.
         scaled: the model after rescaling.
         predicted_scaled_m: (n,) ranges predicted by the scaled model; NaN for ranges without a place on the path.
         scaled_weights: (n,) robust weights by the scaled model.
-        refined: the model after the refinement; None without one.
-        refinement: summary of the refinement; None without one.
-        why_broken: reasons why the refined model cannot be right; empty if there are none. If there are any, the scaled
-            model is the result.
+        tape: the measured lengths, with those left out that cannot be in the map; empty without any.
+        positions: the known positions, with those left out that contradict the others.
+        rivals: other likely time offsets.
+        refined: the map after the refinement; None without one.
         place: how well the place of the map in the site frame is known; None where the frame is that of the first
             camera, or where it has not been judged yet.
         models: all models that were to be joined to this one; empty where there was only one.
         diagnosis: result of the tests of mistakes on the final map; empty before.
-        tape: the measured lengths, with those left out that cannot be in the map; empty without any.
-        positions: the known positions, with those left out that contradict the others.
-        rivals: other likely time offsets.
-        at_refined: the map at rest with all that is measured in it, before it is moved to its estimate; None without
-            a refinement.
-        loops: the loops that were closed in the refined map; None where none were looked for.
     """
 
-    trajectory: Trajectory
-    time_offset: TimeOffset | None
-    time_offset_s: float | None
+    path: PathOfModel
     estimate: ScaleEstimate
     scaled: pycolmap.Reconstruction
     predicted_scaled_m: Array
     scaled_weights: Array
-    refined: pycolmap.Reconstruction | None = None
-    refinement: RefineSummary | None = None
-    why_broken: tuple[str, ...] = ()
+    tape: Tape
+    positions: SurveyedPositions
+    rivals: Rivals
+    refined: RefinedMap | None = None
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
     diagnosis: Diagnosis = field(default_factory=Diagnosis)
-    tape: Tape = field(default_factory=Tape)
-    positions: SurveyedPositions = field(default_factory=SurveyedPositions)
-    rivals: Rivals = NO_RIVALS
-    at_refined: JointMap | None = None
-    loops: LoopClosure | None = None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Return the keyframes of the unscaled model."""
+        return self.path.trajectory
+
+    @property
+    def kept(self) -> RefinedMap | None:
+        """Return the refined map; None where there is none or it is broken, so that the scaled one is the result."""
+        return None if self.refined is None or self.refined.why_broken else self.refined
 
     @property
     def final(self) -> pycolmap.Reconstruction:
-        """Return the refined model, or the scaled one where there is no refined one or it is broken."""
-        return self.scaled if self.refined is None or self.why_broken else self.refined
-
-    @property
-    def kept_refinement(self) -> RefineSummary | None:
-        """Return the summary of the refinement; None where the final model is the scaled one."""
-        return None if self.why_broken else self.refinement
+        """Return the refined model if it is kept, and else the scaled one."""
+        return self.scaled if self.kept is None else self.kept.model
 
     @property
     def all_measured(self) -> JointMap:
@@ -109,7 +142,7 @@ class MetricResult:
 
         It has no kinds where nothing is known of the scale's error.
         """
-        return (self.at_refined if self.kept_refinement is not None else None) or self.estimate.on_map
+        return self.estimate.on_map if self.kept is None else self.kept.on_map
 
     @property
     def kinds(self) -> tuple[KindOnMap, ...]:
@@ -119,7 +152,7 @@ class MetricResult:
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
         """Return what the final model comes from: the kept refinement, or the estimate of the scale."""
-        return self.kept_refinement or self.estimate
+        return self.estimate if self.kept is None else self.kept.summary
 
     @property
     def anchors(self) -> tuple[AnchorEstimate, ...]:
@@ -133,12 +166,12 @@ class MetricResult:
     @property
     def predicted_m(self) -> Array:
         """Return the ranges predicted by the final model, (n,) metres."""
-        return self.predicted_scaled_m if self.kept_refinement is None else self.kept_refinement.predicted_m
+        return self.predicted_scaled_m if self.kept is None else self.kept.summary.predicted_m
 
     @property
     def weights(self) -> Array:
         """Return the robust weights of the ranges by the final model, (n,) in [0, 1]."""
-        return self.scaled_weights if self.kept_refinement is None else self.kept_refinement.weights
+        return self.scaled_weights if self.kept is None else self.kept.summary.weights
 
     @property
     def range_stddev_m(self) -> Array:
@@ -153,8 +186,7 @@ class MetricResult:
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
         """Return the covariance (3, 3) of each keyframe's projection centre by photo; empty if it is not known."""
-        found = None if self.kept_refinement is None else self.kept_refinement.covariance
-        if found is None:
+        if self.kept is None or (found := self.kept.summary.covariance) is None:
             return {}
         index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
         return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
@@ -170,57 +202,46 @@ class MetricResult:
     @property
     def map_errors(self) -> MapErrors | None:
         """Return how the parts of the refined map err together; None if that is not known."""
-        found = None if self.kept_refinement is None else self.kept_refinement.covariance
-        return None if found is None else found.errors
-
-    @cached_property
-    def diagnostics(self) -> ScaleDiagnostics:
-        """Return the scale candidates of the ranges and how many ranges agree with each scale."""
-        return scale_diagnostics(self.estimate, self.trajectory)
-
-    @property
-    def refined_scale(self) -> float | None:
-        """Return metres per SfM unit after the refinement, by least squares over all centres; None without one."""
-        if self.refined is None:
-            return None
-        if self.at_refined is not None:
-            return self.at_refined.metres_per_unit if self.why_broken else self.at_refined.scale.value
-        return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
+        return None if self.kept is None else self.kept.errors
 
     def in_site(self, site: Site) -> MetricResult:
         """Return the same result in the coordinates of a site in whose local frame it is, if they are metres."""
-        offset_m = site.offset_m
-        if self.estimate.frame != "site" or not offset_m.any():
+        offset_m, estimate, refined = site.offset_m, self.estimate, self.refined
+        if estimate.frame != "site" or not offset_m.any():
             return self
         shift = Similarity(1.0, np.eye(3), offset_m)
-        estimate = replace(
-            self.estimate,
-            metric_from_sfm=shift @ self.estimate.metric_from_sfm,
-        ).with_anchors(tuple(_moved_anchor(anchor, offset_m) for anchor in self.estimate.anchors))
-        refinement = self.refinement and replace(
-            self.refinement, anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.refinement.anchors)
-        )
+        moved = replace(estimate, metric_from_sfm=shift @ estimate.metric_from_sfm)
+        if refined is not None:
+            refined = replace(
+                refined,
+                model=rescale(refined.model, shift),
+                summary=replace(refined.summary, anchors=_moved_anchors(refined.summary.anchors, offset_m)),
+                loops=refined.loops and refined.loops.moved(offset_m),
+            )
         return replace(
             self,
-            estimate=estimate,
+            estimate=moved.with_anchors(_moved_anchors(estimate.anchors, offset_m)),
             scaled=rescale(self.scaled, shift),
-            refined=None if self.refined is None else rescale(self.refined, shift),
             positions=self.positions.moved(offset_m),
-            refinement=refinement,
-            loops=self.loops and self.loops.moved(offset_m),
+            refined=refined,
         )
 
-    def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:
-        """Return the result as doubtful for further reasons, with advice on them; unchanged if there are no reasons."""
-        if not reasons:
+    def doubted(self, *doubts: Doubt) -> MetricResult:
+        """Return the result as doubtful for further reasons, with advice on them; unchanged if there are none."""
+        if not doubts:
             return self
         estimate = self.estimate
         kept = estimate.reasons if estimate.verdict == "doubtful" else ()
-        all_advice = tuple(dict.fromkeys((*advice, *estimate.advice)))
-        doubted = replace(estimate, verdict="doubtful", reasons=(*reasons, *kept), advice=all_advice)
+        reasons = (*(doubt.reason for doubt in doubts), *kept)
+        advice = (*(doubt.advice for doubt in doubts if doubt.advice), *estimate.advice)
+        doubted = replace(estimate, verdict="doubtful", reasons=reasons, advice=tuple(dict.fromkeys(advice)))
         return replace(self, estimate=doubted)
 
 
-def _moved_anchor(anchor: AnchorEstimate, offset_m: Array) -> AnchorEstimate:
-    places = {name: getattr(anchor, name) for name in ("position_m", "prior_position_m", "mirror_position_m")}
-    return replace(anchor, **{name: at + offset_m for name, at in places.items() if at is not None})
+def _moved_anchors(anchors: Sequence[AnchorEstimate], offset_m: Array) -> tuple[AnchorEstimate, ...]:
+    names = ("position_m", "prior_position_m", "mirror_position_m")
+    places = [{name: at for name in names if (at := getattr(anchor, name)) is not None} for anchor in anchors]
+    return tuple(
+        replace(anchor, **{name: at + offset_m for name, at in of_anchor.items()})
+        for anchor, of_anchor in zip(anchors, places, strict=True)
+    )

@@ -9,14 +9,11 @@ import pycolmap
 
 from rangesfm.colmap.transform import without_photos
 from rangesfm.errors import InputError
-from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 
-def place_ranges(
-    run: SurveyRun, models: Sequence[pycolmap.Reconstruction], times: ImageTimes | None
-) -> list[PathOfModel]:
+def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> list[PathOfModel]:
     """Return unscaled models of a survey with the ranges on their paths, the first one first.
 
     The time offset is searched for on the path of the first model, unless it is given. A photo that several models have
@@ -25,27 +22,31 @@ def place_ranges(
     Args:
         run: the survey.
         models: unscaled models of its photos.
-        times: of the photos; None where the log names photos.
 
     Raises:
         InputError: times are needed and no photo of the first model has one, or reference or ranges do not fit it.
         GeometryError: the ranges do not determine the time offset.
     """
-    trajectory = _path_with_times(run, models[0], times)
+    trajectory = _path_of_model(run, models[0])
+    if not len(trajectory):
+        first = min(image.name for image in models[0].images.values())
+        raise InputError(f"none of the model's photos has a time, the first is {first}", run.survey.images.times)
+    num = models[0].num_reg_frames()
+    if num_without_time := num - len(trajectory):
+        run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
     check_times(run, trajectory)
     offset, radio_times_s = run.find_time_offset(trajectory), run.inputs.log.timestamp_s
-    given_s = run.survey.ranges.time_offset_s or 0.0
-    offsets_s = given_s if offset is None or radio_times_s is None else offset.at(radio_times_s)
-    paths = [PathOfModel("sparse/0", models[0], trajectory, run.ranges_on(trajectory, offsets_s), offset)]
+    offset_s = 0.0 if offset is None or radio_times_s is None else offset.at(radio_times_s)
+    paths = [PathOfModel("sparse/0", models[0], trajectory, run.ranges_on(trajectory, offset_s), offset)]
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):
         rest = without_photos(model, names)
-        path = _path_of_model(rest, times)
+        path = _path_of_model(run, rest)
         if not len(path):
             run.journal.warn(f"sparse/{k} is left out: its photos have no times, or are also in other models")
             continue
         names.update(path.image_names)
-        placed = run.ranges_on(path, offsets_s, may_be_none=True)
+        placed = run.ranges_on(path, offset_s, may_be_none=True)
         paths.append(PathOfModel(f"sparse/{k}", rest, path, placed, offset))
     return paths
 
@@ -64,19 +65,7 @@ def check_times(run: SurveyRun, path: Trajectory) -> None:
         run.ranges_on(path, offset_s or 0.0)
 
 
-def _path_with_times(run: SurveyRun, model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    """Return the path of a model's photos; photos without a time are left out with a warning, if times are needed."""
-    trajectory = _path_of_model(model, times)
-    if not len(trajectory):
-        first = min(image.name for image in model.images.values())
-        raise InputError(f"none of the model's photos has a time, the first is {first}", run.survey.images.times)
-    num = model.num_reg_frames()
-    if num_without_time := num - len(trajectory):
-        run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
-    return trajectory
-
-
-def _path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    if times is None:
+def _path_of_model(run: SurveyRun, model: pycolmap.Reconstruction) -> Trajectory:
+    if run.times is None:
         return trajectory_from_reconstruction(model)
-    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
+    return trajectory_from_reconstruction(model, run.times.by_name(), time_resolution_s=run.times.resolution_s)

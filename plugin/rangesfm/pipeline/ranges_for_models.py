@@ -50,9 +50,7 @@ def _ranges_of_map(run: SurveyRun, metric: MetricResult, image_times_s: Mapping[
     """
     estimate, log, inputs = metric.estimate, metric.observations.log, run.inputs
     if log.timestamp_s is not None:
-        offset = metric.time_offset
-        offset_s = (metric.time_offset_s or 0.0) if offset is None else offset.at(log.timestamp_s)
-        log = replace(log, timestamp_s=log.timestamp_s + offset_s)
+        log = replace(log, timestamp_s=log.timestamp_s + metric.path.offset_s)
     anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
     scaled = estimate.metric_from_sfm
     return ModelRanges(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -18,7 +18,7 @@ from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
 from rangesfm.measurements.source import Measured
-from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
@@ -29,16 +29,11 @@ from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import at_most
 
-
-@dataclass(frozen=True)
-class RefinedMap:
-    """A refined map as a result, and at rest with its equations."""
-
-    metric: MetricResult
-    at_rest: MapAtRest
+MergeTracks = Callable[[pycolmap.Reconstruction], None]
+"""Makes one point of those that two passes saw apart, in place."""
 
 
-def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
+def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
     """Refine a scaled map with all that was measured. Where that breaks the map, the scaled map stays the result.
 
     Raises:
@@ -47,34 +42,34 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
     run = _with_open_clock(run, metric)
     measured = _measured(run, metric)
     with at_most(run.survey.mapper.num_threads):
-        problem = _problem(run, metric, measured, metric.scaled, is_refined=is_refined_model(run.survey.images.model))
+        problem = _problem(run, metric, measured, is_refined=is_refined_model(run.survey.images.model))
         return _finished(run, metric, measured, refine(problem, measured.markers))
 
 
 def refine_closed_map(
-    run: SurveyRun, refined: RefinedMap, loops: LoopPoses, merge_tracks: Callable[[pycolmap.Reconstruction], None]
-) -> RefinedMap | None:
+    run: SurveyRun, metric: MetricResult, loops: LoopPoses, merge_tracks: MergeTracks
+) -> MetricResult | None:
     """Close the loops of a refined map, and refine it again; None if they are closed in it.
 
     Args:
-        loops: measured relative poses, by ids of frames. merge_tracks: makes one of points that two passes saw apart,
-            in place.
+        metric: with the refined map. loops: measured relative poses, by ids of frames.
 
     Raises:
         SolverError: as for ``refine_map``.
     """
-    metric, run = refined.metric, _with_open_clock(run, refined.metric)
+    run = _with_open_clock(run, metric)
     measured = _measured(run, metric)
+    assert metric.kept is not None, "a refined map"
     with at_most(run.survey.mapper.num_threads):
-        problem = _problem(run, metric, measured, metric.final, is_refined=True)
-        known = problem.like(refined.at_rest.problem)
+        problem = _problem(run, metric, measured, is_refined=True)
+        known = problem.like(replace(problem, kinds=metric.kept.kinds))
         rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
         return None if rest is None else _finished(run, metric, measured, rest)
 
 
 def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
     """Return the survey with the time offset to be estimated where it is not certain."""
-    offset = metric.time_offset
+    offset = metric.path.time_offset
     if offset is None or offset.is_certain or run.survey.refine.time_offset_stddev_s:
         return run
     return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
@@ -91,12 +86,10 @@ def _inputs(run: SurveyRun, metric: MetricResult) -> RangingInputs:
     return replace(run.inputs, tape=metric.tape, positions=metric.positions)
 
 
-def _problem(
-    run: SurveyRun, metric: MetricResult, measured: Measured, model: pycolmap.Reconstruction, *, is_refined: bool
-) -> MapProblem:
+def _problem(run: SurveyRun, metric: MetricResult, measured: Measured, *, is_refined: bool) -> MapProblem:
     survey = run.survey
     return map_problem(
-        pycolmap.Reconstruction(model),
+        pycolmap.Reconstruction(metric.final),
         measured,
         metric.trajectory,
         camera=survey.camera,
@@ -107,60 +100,60 @@ def _problem(
     )
 
 
-def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
+def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> MetricResult:
     """Learn the errors at a map at rest, and return it as a result with its covariance."""
-    survey, estimate = run.survey, metric.estimate
-    at, factor = _measured_at_rest(run, metric, rest), 1.0
-    if at is not None:
-        if survey.refine.time_offset_stddev_s:
-            at = at.without_clocks()
-        factor = at.problem.bending_factor
-        at = at.concluded()
-        for kind in at.kinds:
-            rest = rest.with_learnt(kind.learnt_errors(at))
+    options, on_map, factor = run.survey.refine, metric.estimate.on_map, 1.0
+    if on_map.kinds:  # else nothing is known of the scale's error
+        on_map = _measured_at_rest(run, metric, rest)
+        if options.time_offset_stddev_s:
+            on_map = on_map.without_clocks()
+        factor = on_map.problem.bending_factor
+        on_map = on_map.concluded()
+        for kind in on_map.kinds:
+            rest = rest.with_learnt(kind.learnt_errors(on_map))
     covariance = None
-    if survey.refine.covariance:
+    if options.covariance:
         # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
         covariance = joint_errors(rest, max(factor, 1.0))
         if covariance is None:
             run.journal.warn(
                 "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
             )
-    refined = rest.problem.metric
-    refined.update_point_3d_errors()
+    model, path = rest.problem.metric, metric.trajectory
+    model.update_point_3d_errors()
     summary = summarize(rest, measured, covariance, factor)
-    broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
+    broken = why_broken(metric.scaled, model, path, metric.estimate, summary, options.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
             f"the refinement broke the map: {'; '.join(broken)}; nor do the points of the model before it fit the "
             "photos: check that model, photos and camera parameters belong together (rangesfm scale gives the path "
             "alone)"
         )
-    return RefinedMap(
-        replace(metric, refined=refined, refinement=summary, why_broken=broken, at_refined=at),
-        rest,
-    )
+    if on_map.is_at_rest:
+        scale = on_map.metres_per_unit if broken else on_map.scale.value
+    else:
+        scale = align_points(path.centers, path.as_in(model).centers).scale
+    return replace(metric, refined=RefinedMap(model, summary, rest.problem.kinds, on_map, scale, broken))
 
 
-def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined: RefinedMap) -> RefinedMap:
-    """Return the refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
+def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
+    """Return a refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
 
     If that breaks the map, the first refinement stays.
 
     Args:
-        start: the scaled map.
+        start: the scaled map. metric: the same, refined.
     """
-    metric, estimate = refined.metric, start.estimate
-    refinement, at = metric.kept_refinement, metric.all_measured
-    if refinement is None:
-        return refined
+    if metric.kept is None:
+        return metric
+    estimate, at, summary = start.estimate, metric.kept.on_map, metric.kept.summary
     for sides in (sides for each in at.kinds for sides in each.sides(at)):
         estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
         if sides.has_crossed:
             again = refine_map(run, replace(start, estimate=estimate))
-            return refined if again.metric.kept_refinement is None else again
-        refinement = replace(refinement, anchors=sides.applied_to(refinement.anchors))
-    return replace(refined, metric=replace(metric, estimate=estimate, refinement=refinement))
+            return metric if again.kept is None else again
+        summary = replace(summary, anchors=sides.applied_to(summary.anchors))
+    return replace(metric, estimate=estimate, refined=replace(metric.kept, summary=summary))
 
 
 def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
@@ -175,16 +168,14 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
-    """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
-    start, model = metric.estimate.on_map, rest.problem.metric
-    if not start.kinds:
-        return None
+def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap:
+    """Return a map at rest with all that is measured in it."""
+    model, before = rest.problem.metric, metric.estimate.kinds
     path = metric.trajectory.as_in(model)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
-    of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
+    of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, before, rest)
     located, _ = kinds_in_map(_inputs(run, metric), of_model)
     others = tested_kinds(
         [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Mask, median, rms
 from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.errors import number_text
+from rangesfm.estimation.scale.scale_diagnostics import scale_diagnostics
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.positions.known_marks import locate_points
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
-from rangesfm.pipeline.join_models import ModelVerdict
-from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.metric_result import MetricResult, ModelVerdict
 from rangesfm.result import entries
 from rangesfm.result.result_tables import (
     CenterCovariances,
@@ -101,10 +101,11 @@ def _model(model: ModelVerdict, metric_from_joined: Similarity) -> entries.Model
 
 
 def _time_offset(found: MetricResult) -> entries.TimeOffsetEntry:
-    offset, given_s = found.time_offset, found.time_offset_s
+    offset = found.path.time_offset
     if offset is None:
-        stddev_s = None if given_s is None else 0.0
-        return entries.TimeOffsetEntry(value_s=given_s, stddev_s=stddev_s, estimated=False, note=None)
+        return entries.TimeOffsetEntry(value_s=None, stddev_s=None, estimated=False, note=None)
+    if offset.is_given:
+        return entries.TimeOffsetEntry(value_s=offset.value_s, stddev_s=0.0, estimated=False, note=None)
     in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
     return entries.TimeOffsetEntry.model_validate({**vars(offset), **in_ppm, "estimated": True})
 
@@ -146,8 +147,7 @@ def _by_anchor(found: MetricResult, chosen: Mask) -> Iterator[tuple[str, Mask]]:
 
 
 def _loops(found: MetricResult) -> entries.LoopsEntry | None:
-    loops = found.loops
-    if loops is None:
+    if found.refined is None or (loops := found.refined.loops) is None:
         return None
     return entries.LoopsEntry(
         num_proposed=loops.num_proposed,
@@ -159,18 +159,18 @@ def _loops(found: MetricResult) -> entries.LoopsEntry | None:
 
 
 def _refinement(found: MetricResult) -> entries.RefineEntry | None:
-    summary = found.refinement
-    if summary is None:
+    if found.refined is None:
         return None
+    why_broken, summary = found.refined.why_broken, found.refined.summary
     tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
     others = {
-        "kept": not found.why_broken,
-        "why_not_kept": found.why_broken,
+        "kept": not why_broken,
+        "why_not_kept": why_broken,
         "iterations": summary.num_iterations,
         "keyframe_graph_steps": summary.num_graph_steps,
         "correlation_inflation": summary.errors.inflation,
         "converged": summary.converged,
-        "scale_value": found.refined_scale,
+        "scale_value": found.refined.scale,
         "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
         "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
         "time_offset_change_s": summary.time_shift_s,
@@ -276,13 +276,12 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
     if by_photo:
         rows, columns = np.triu_indices(3)
         yield CenterCovariances(tuple(by_photo), *np.array(list(by_photo.values()))[:, rows, columns].T)
-    if found.loops is not None:
-        kinds = {"closed": found.loops.closed, "contradicted": found.loops.contradicted}
+    if found.refined is not None and (loops := found.refined.loops) is not None:
+        kinds = {"closed": loops.closed, "contradicted": loops.contradicted}
         pairs = [(*pair, kind) for kind, of_kind in kinds.items() for pair in of_kind]
         yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
-    curve = None if found.time_offset is None else found.time_offset.curve
-    if curve is not None:
-        yield TimeOffsetCurve(curve.offsets_s, curve.costs_m)
+    if (offset := found.path.time_offset) is not None and not offset.is_given:
+        yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs_m)
     markers = found.tape.found_markers
     if markers:
         names = [name for name, marker in markers.items() for _ in marker.image_names]
@@ -291,7 +290,7 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         yield TagCorners(tuple(names), tuple(photos), *pixels.T)
     if len(found.observations.log):
         yield ranges_as_used(found)
-        diagnostics, log = found.diagnostics, found.observations.log
+        diagnostics, log = scale_diagnostics(found.estimate, found.trajectory), found.observations.log
         rows = diagnostics.candidate_rows
         times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
         anchor_ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
@@ -318,7 +317,7 @@ def ranges_as_used(found: MetricResult) -> RangesAsUsed:
         keyframe_after=tuple(names[i] for i in observations.after),
         weight=np.where(observations.before >= 0, observations.fraction, np.nan),
         predicted_scaled_m=found.predicted_scaled_m,
-        predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
+        predicted_refined_m=unknown if found.kept is None else found.kept.summary.predicted_m,
         residual_m=found.residuals_m,
         robust_weight=np.where(has_say, found.weights, np.nan),
         status=tuple(labels[status] for status in observations.status.tolist()),

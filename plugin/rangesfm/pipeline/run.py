@@ -17,28 +17,27 @@ from rangesfm.measurements.lengths.markers import locatable
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.pipeline.adoption import with_likeliest_cause
-from rangesfm.pipeline.close_unscaled import close_loops_of_models
-from rangesfm.pipeline.make_metric_map import join_by_survey, metric_map
+from rangesfm.pipeline.close_loops import close_loops_of_models
+from rangesfm.pipeline.join_models import join_models, tie_by_photos
+from rangesfm.pipeline.make_metric_map import metric_map, with_likeliest_cause
 from rangesfm.pipeline.map_photos import (
     begin_run,
-    checked_keyframes,
     find_keyframes,
     map_keyframes,
     read_registered,
-    tell_of_times,
+    refuse_to_overwrite,
+    result_names,
+    with_keyframes,
     with_photos_in_folder,
     with_tags,
+    with_times,
 )
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.place_of_result import refuse_to_overwrite, result_names
 from rangesfm.pipeline.place_ranges import place_ranges
 from rangesfm.pipeline.plan_again import with_advice
 from rangesfm.pipeline.run_results import RunResult, write_results
-from rangesfm.pipeline.tie_models import tie_by_photos
 from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.result.summary import ResultSummary
-from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
@@ -76,13 +75,12 @@ def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> RunRes
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         run = replace(run, survey=with_photos_in_folder(survey, run.journal, restart=restart))
-        run = run.with_photos(list_images(run.survey.photos_path), "the folder")
-        keyframes, times = checked_keyframes(run)
+        run, keyframes = with_keyframes(run)
         run = with_tags(run, keyframes)
         # An earlier result keeps its reconstruction until the new result is complete.
         deferred = (output.path / ResultSummary.NAME).exists()
         models = map_keyframes(run.survey, keyframes, run.journal, restart, deferred=deferred)
-        paths = tie_by_photos(run, place_ranges(run, models, times), times)
+        paths = tie_by_photos(run, place_ranges(run, models))
         return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled))
 
 
@@ -136,15 +134,14 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
     Returns:
         As ``map_in_metres``.
     """
-    times = None
     if run.inputs.needs_times:
         times = times_of_model(run.survey, sfm, run.survey.given_model_path)
         run.journal.note(*times.assumed)
         run.journal.warn(*times.notes)
-        tell_of_times(run, times)
+        run = with_times(run, times)
     names = sorted(image.name for image in sfm.images.values())
     run = with_tags(run.with_photos(names, "the map"), names)
-    return map_in_metres(run, place_ranges(run, [sfm], times), refine=refine)
+    return map_in_metres(run, place_ranges(run, [sfm]), refine=refine)
 
 
 def map_in_metres(
@@ -163,7 +160,7 @@ def map_in_metres(
         in the local frame of the inputs but in the coordinates that were given, where these are metres.
     """
     with run.journal.stage("scale"):
-        path, verdicts = join_by_survey(run, paths, must_join=must_join)
+        path, verdicts = join_models(run, paths, must_join=must_join)
         images = run.survey.images
         baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
         tape = run.inputs.tape.with_more(baselines)
@@ -175,7 +172,7 @@ def map_in_metres(
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:
-        run, made = with_likeliest_cause(run, path, made)
+        run, made = with_likeliest_cause(run, made)
     return run, made.in_site(run.inputs.site)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
+from rangesfm.measurements.joint_map import Doubt
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.result_records import disagreements, distance_rows, summary_of, tables_of
@@ -62,7 +63,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     distances = distance_rows(metric)
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
     journal.warn(*disagreeing)
-    metric = metric.doubted(disagreeing)
+    metric = metric.doubted(*map(Doubt, disagreeing))
     folder = survey.output.path
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
@@ -102,8 +103,8 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
         return ()
     frame = metric.estimate.frame
     scaled = metric.trajectory.as_in(metric.scaled)
-    refined = None if metric.kept_refinement is None else metric.trajectory.as_in(metric.final)
-    loops_open = None if metric.loops is None else metric.loops.before
+    refined = None if metric.kept is None else metric.trajectory.as_in(metric.final)
+    loops_open = None if metric.kept is None or metric.kept.loops is None else metric.kept.loops.before
     rows = papers_table(scaled, refined, inputs.reference, frame=frame, loops_open=loops_open)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,14 +13,14 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.positions.clock import POSITIONS
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.time_offset import REMEDY, estimate_time_offset
+from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.progress import Journal
+from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
@@ -38,8 +38,7 @@ class PathOfModel:
         name: name for the user, such as "sparse/0".
         trajectory: path of its photos that have a time.
         observations: ranges on that path, from the log that all models share.
-        time_offset: estimate of the time offset, with which the ranges were placed; None where it was given or is not
-            needed.
+        time_offset: with which the ranges were placed; None where the log names photos.
     """
 
     name: str
@@ -48,19 +47,11 @@ class PathOfModel:
     observations: RangeObservations
     time_offset: TimeOffset | None = None
 
-
-class Clock(NamedTuple):
-    """A clock with several likely time offsets.
-
-    Attributes:
-        whose: it is, in words. offset: of it, with its rivals. remedy: what the user can do.
-        estimate_at: returns the estimate at another offset, or raises GeometryError.
-    """
-
-    whose: str
-    offset: TimeOffset
-    remedy: str
-    estimate_at: Callable[[TimeOffset], ScaleEstimate]
+    @property
+    def offset_s(self) -> float | Array:
+        """Image time minus time of the log: (n,) for its ranges, or 0 where it names photos."""
+        times_s = self.observations.log.timestamp_s
+        return 0.0 if self.time_offset is None or times_s is None else self.time_offset.at(times_s)
 
 
 @dataclass(frozen=True)
@@ -70,11 +61,13 @@ class SurveyRun:
     Attributes:
         inputs: what was read from its files, measured in metres.
         journal: is told of stages and warnings.
+        times: of the photos; None where they are not needed, or not yet known.
     """
 
     survey: Survey
     inputs: RangingInputs
     journal: Journal
+    times: ImageTimes | None = None
 
     def changed(self, values: Mapping[str, Any]) -> SurveyRun:
         """Return the same with other options by dotted key, as ``Survey.changed``."""
@@ -91,13 +84,17 @@ class SurveyRun:
         return replace(self, inputs=self.inputs.with_photos(photos))
 
     def find_time_offset(self, trajectory: Trajectory) -> TimeOffset | None:
-        """Search for the time offset between the clocks; None where it is given, or where the log names photos.
+        """Return the time offset between the clocks, which is searched for if it is not given.
+
+        None where the log names photos.
 
         Raises:
             GeometryError: the ranges do not determine it.
         """
         inputs, survey = self.inputs, self.survey
-        if inputs.log.image_name is not None or survey.ranges.time_offset_s is not None:
+        if survey.ranges.time_offset_s is not None:
+            return TimeOffset.given(survey.ranges.time_offset_s)
+        if inputs.log.image_name is not None:
             return None
         with self.journal.stage("time offset"):
             offset = estimate_time_offset(
@@ -149,26 +146,6 @@ class SurveyRun:
             raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
         begun = RangeEstimate.begun(log, self.survey.ranges)
         return estimate_scale(located, path.trajectory, bending, self.survey.scale, begun).remarked(remarks)
-
-    def clocks(self, path: PathOfModel) -> Iterator[Clock]:
-        """Yield the clocks of a model whose time offsets were searched for, and are not certain."""
-        offset, track, log = path.time_offset, self.inputs.positions.antenna, self.inputs.log
-
-        def at_ranges_offset(other: TimeOffset) -> ScaleEstimate:
-            assert log.timestamp_s is not None, "clocks belong to a log with times"
-            return self.estimate_scale(
-                replace(path, observations=self.ranges_on(path.trajectory, other.at(log.timestamp_s)))
-            )
-
-        def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
-            antenna = track and replace(track, offset_s=other.value_s)
-            positions = replace(self.inputs.positions, antenna=antenna)
-            return replace(self, inputs=replace(self.inputs, positions=positions)).estimate_scale(path)
-
-        if offset is not None and offset.rivals:
-            yield Clock("", offset, REMEDY, at_ranges_offset)
-        if track is not None and track.search is not None and track.search.rivals:
-            yield Clock(" of the positions", track.search, POSITIONS.remedy, at_positions_offset)
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

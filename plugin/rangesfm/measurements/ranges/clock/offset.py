@@ -38,7 +38,7 @@ class TimeOffset:
     Attributes:
         value_s: the offset; if the clocks drift, at the radio's time ``reference_s``.
         stddev_s: its standard deviation, which accounts for correlated residuals.
-        curve: cost of all offsets, for the report.
+        curve: cost of all offsets, for the report; of none where the offset was given.
         offset_matters: False if any offset near the value puts the ranges at the same photos.
         drift: gain of the camera's clock on the radio's, seconds per second.
         drift_stddev: its standard deviation; infinite if no drift was estimated.
@@ -62,6 +62,16 @@ class TimeOffset:
     probability: float = 1.0
     rivals: tuple[Rival, ...] = ()
     is_certain: bool = True
+
+    @classmethod
+    def given(cls, value_s: float) -> TimeOffset:
+        """Return an offset that was not searched for."""
+        return cls(value_s, 0.0, CostCurve(np.zeros(0), np.zeros(0)))
+
+    @property
+    def is_given(self) -> bool:
+        """Whether it was not searched for."""
+        return not len(self.curve.offsets_s)
 
     def of_rival(self, rival: Rival) -> TimeOffset:
         """Return the offset with a rival's value; the drift was estimated for the present value and is not followed."""
