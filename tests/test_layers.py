@@ -53,7 +53,7 @@ MODULES = {
 }
 
 OF_SENSOR = ("inertial_motions", "inertial_fit", "inertial_scale", "motion", "preintegration", "sensor_prior")
-OF_FIT = ("cost", "points_cost", "gravity", "radio", "site_positions")
+OF_FIT = ("cost", "gravity", "radio")
 ON_MAP = ("range_scale", "range_start", "length_scale", "position_scale")
 # Modules that say how a kind is measured. Others in the folder of a kind hold what was read.
 KINDS = {
@@ -166,6 +166,6 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     of_one_kind = {name for name in MODULES if name.startswith(("measurements.ranges.", "measurements.positions."))}
     plans = {"planning.expected", "planning.planned_sensor"}
     assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *plans, *of_ranges, *of_one_kind}
-    logs = {"measurements.ranges.radio", "measurements.positions.site_positions"}  # several kinds are in one log
+    logs = {"measurements.ranges.radio"}  # several kinds are in one log
     others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}
     assert not {(module, name) for module, name in others if module.split(".")[1] != name.split(".")[1]}

@@ -34,8 +34,7 @@ from rangesfm.measurements.lengths.cost import Lengths
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.positions.cost import AntennaPositions
-from rangesfm.measurements.positions.points_cost import ControlPoints
+from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.association import associate
@@ -111,7 +110,7 @@ def scene() -> Scene:
             (("A0", "A1"), ("A1", "A2")), points, rng.uniform(3, 9, 2), np.array([0.1, 0.2]), {},
             bias_stddev_m=0.1, loss=RobustLoss(3.0, is_bounded=True),
         ),
-        "control point": ControlPoints(
+        "control point": MarkedPositions(
             ("M0", "M2"), points, rng.normal(0, 3, (2, 3)), np.array([0.02, 0.05]), {"M0": np.diag([1e-4, 2e-4, 3e-4])}
         ),
         "gravity": UpwardDirection(Gravity(poses.world_from_rig[0].T @ [0.0, 0.6, 0.8], 0.05)),

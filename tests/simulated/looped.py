@@ -29,13 +29,13 @@ from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.cost import Ranges
-from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
+from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
-from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.sfm.database import create_database
 from rangesfm.sfm.loops.loop_finder import LoopFinder
@@ -199,9 +199,11 @@ class ScaledMap:
 
     def problem(self, model: pycolmap.Reconstruction, ranges: Ranges, *, is_refined: bool) -> MapProblem:
         """Return the problem of a copy of a map in metres."""
+        metric = pycolmap.Reconstruction(model)
+        at = MapToFit.of_model(metric, self.trajectory, RefineOptions(), {}, ranges.placed_anchors)
         return map_problem(
-            pycolmap.Reconstruction(model),
-            Measured((RadioLog(ranges),)),
+            metric,
+            tuple(measured_by_radio(ranges, at)),
             self.trajectory,
             camera=CameraOptions(refine_intrinsics=False),
             options=RefineOptions(),
@@ -213,7 +215,7 @@ class ScaledMap:
     def refined(self, start: pycolmap.Reconstruction | None = None) -> MapAtRest:
         """Refine the scaled map, or another map in metres."""
         model = self.scaled if start is None else start
-        return refine(self.problem(model, self.ranges, is_refined=start is not None), {})
+        return refine(self.problem(model, self.ranges, is_refined=start is not None))
 
     def error_m(self, model: pycolmap.Reconstruction) -> float:
         """Return the root mean square error of the keyframes, without alignment."""
@@ -263,7 +265,6 @@ class SimulatedMap:
         rest = refine_with_loops(
             problem,
             problem.like(self.at_rest.problem),
-            {},
             self.finder.relative_poses(loops),
             lambda model: merge_tracks(model, path, seed=0),
         )

@@ -14,12 +14,12 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.errors import InputError
 from rangesfm.measurements.kind import Block, MapState, Measurements
-from rangesfm.measurements.source import Measured
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.util.geometry.numerics import ROUNDING
-from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.poses import frames_in_order, model_poses
 from rangesfm.util.geometry.trajectory import Trajectory, pose_of
 
 
@@ -31,7 +31,7 @@ class MapProblem:
         metric: the model.
         kinds: the measurements, priors among them.
         timed_ids: ids of the frames to whose indices the measurements refer, in this order.
-        first_pose_is_fixed: the gauge. is_placed: whether measurements place the map in their world.
+        first_pose_is_fixed: the gauge.
         is_refined: whether the model was refined with its measurements before, which pull it from the photos' optimum.
         marker_ids: 3-D points of the model that are marks, by name.
         left_out_ids: 3-D points that do not take part.
@@ -45,7 +45,6 @@ class MapProblem:
     camera: CameraOptions
     options: RefineOptions
     first_pose_is_fixed: bool
-    is_placed: bool
     num_threads: int
     is_refined: bool = False
     marker_ids: Mapping[str, int] = field(default_factory=dict)
@@ -55,13 +54,17 @@ class MapProblem:
     @property
     def frame_ids(self) -> Indices:
         """Ids of all frames: those to whose indices the measurements refer, then the others."""
-        others = np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), self.timed_ids)
-        return np.concatenate([self.timed_ids, others])
+        return frames_in_order(self.metric, self.timed_ids)
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks in photos to which the measurements refer, by name."""
+        return {name: marker for kind in self.kinds for name, marker in kind.markers.items()}
 
     @property
     def held_frame(self) -> int:
         """Index of the frame that is held while nothing else places the map; -1 where measurements do."""
-        return 0 if self.first_pose_is_fixed or not self.is_placed else -1
+        return 0 if self.first_pose_is_fixed or not any(kind.places_map for kind in self.kinds) else -1
 
     @property
     def start(self) -> MapState:
@@ -143,7 +146,7 @@ class MapProblem:
 
 def map_problem(
     metric: pycolmap.Reconstruction,
-    measured: Measured,
+    kinds: Sequence[Measurements],
     trajectory: Trajectory,
     *,
     camera: CameraOptions,
@@ -152,28 +155,26 @@ def map_problem(
     is_refined: bool,
     num_threads: int,
 ) -> MapProblem:
-    """Return the problem of a metric model, with the noise of the measurements to begin with.
+    """Return the problem of a metric model and its measurements with their priors.
 
     Args:
-        trajectory: of the unscaled model. Others as in the problem.
+        kinds: with the noise to begin with. trajectory: of the unscaled model. Others as in the problem.
 
     Raises:
         InputError: the offset of a clock is to be estimated without times.
     """
     if options.time_offset_stddev_s and trajectory.timestamps_s is None:
         raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
-    problem = MapProblem(
+    return MapProblem(
         metric,
-        (),
+        (*kinds, *(prior for kind in kinds for prior in kind.priors())),
         trajectory.frame_ids,
         camera,
         options,
         first_pose_is_fixed,
-        measured.is_placed,
         num_threads,
         is_refined,
     )
-    return replace(problem, kinds=measured.kinds(metric, problem.frame_ids, trajectory, options))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from rangesfm.estimation.vision_information import (
     project,
 )
 from rangesfm.measurements.kind import Block, MapState
-from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.marks import add_marks, errors_beyond_features, remove_marks
 from rangesfm.solver.bundle_adjustment import (
     BundleAdjustment,
@@ -95,40 +94,35 @@ class MapAtRest:
         return self.solutions[-1].converged and self.is_still
 
 
-def refine(problem: MapProblem, markers: Mapping[str, Marker]) -> MapAtRest:
+def refine(problem: MapProblem) -> MapAtRest:
     """Refine a model in place, and return it at rest.
 
     Misplaced points (see ``misplaced_points``), as wrong matches make them, do not take part.
 
-    Args:
-        markers: that the measurements refer to, by name.
-
     Raises:
         SolverError: the solver failed. InputError: an option passed through to COLMAP is unknown.
     """
-    with _marks_in_map(problem, markers) as marked:
-        marked, adjustment, rays = _without_misplaced(marked, markers)
+    with _marks_in_map(problem) as marked:
+        marked, adjustment, rays = _without_misplaced(marked)
         return _adjusted(adjustment, straighten(marked, rays))
 
 
 @contextmanager
-def _marks_in_map(problem: MapProblem, markers: Mapping[str, Marker]) -> Iterator[MapProblem]:
+def _marks_in_map(problem: MapProblem) -> Iterator[MapProblem]:
     """Add marks to the map as points inside the block."""
-    marker_ids = add_marks(problem.metric, markers)
+    marker_ids = add_marks(problem.metric, problem.markers)
     yield replace(problem, marker_ids=marker_ids)
     remove_marks(problem.metric, marker_ids)
 
 
-def _without_misplaced(
-    problem: MapProblem, markers: Mapping[str, Marker]
-) -> tuple[MapProblem, BundleAdjustment, Observations]:
+def _without_misplaced(problem: MapProblem) -> tuple[MapProblem, BundleAdjustment, Observations]:
     """Return the problem without the misplaced points, its bundle adjustment, and the observations of all points."""
     frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     adjustment = problem.of_photos(problem.options.max_num_iterations)
-    beyond_m2 = errors_beyond_features(adjustment, markers, problem.marker_ids)
+    beyond_m2 = errors_beyond_features(adjustment, problem.markers, problem.marker_ids)
     problem = problem.replaced(lambda _, kind: kind.with_errors_of_marks(beyond_m2))
     rays = rays.with_pixel_stddev(adjustment.pixel_stddev)
     return replace(problem, visible_m=_just_visible_m(rays, model_poses(problem.metric, frame_ids))), adjustment, rays
@@ -137,7 +131,6 @@ def _without_misplaced(
 def refine_with_loops(
     problem: MapProblem,
     known: MapProblem,
-    markers: Mapping[str, Marker],
     loops: LoopPoses,
     merge_tracks: Callable[[pycolmap.Reconstruction], None],
 ) -> MapAtRest | None:
@@ -145,7 +138,6 @@ def refine_with_loops(
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
-        markers: as for ``refine``.
         loops: measured relative poses, by ids of frames in place of indices.
         merge_tracks: makes one point of those that two passes saw apart, in place.
     """
@@ -154,20 +146,20 @@ def refine_with_loops(
         np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
         for ids in (loops.reference, loops.frame)
     )
-    seen, _, rays = _without_misplaced(problem, {})
+    seen, _, rays = _without_misplaced(problem)
     at_indices = replace(loops, reference=reference, frame=frame)
     if (closed := close_in_graph(seen, seen.like(known), rays, at_indices)) is None:
         return None
     merge_tracks(problem.metric)
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
     # so only when those that have merged have straightened it.
-    with _marks_in_map(problem, markers) as marked:
-        marked, adjustment, _ = _without_misplaced(marked, markers)
+    with _marks_in_map(problem) as marked:
+        marked, adjustment, _ = _without_misplaced(marked)
         added = marked.add_to(adjustment, closed.blocks)
         solve_bundle_adjustment(adjustment, marked.visible_m)
         blocks = added.state(problem.metric, problem.frame_ids).blocks
     merge_tracks(problem.metric)
-    return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)), markers)
+    return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)))
 
 
 def _just_visible_m(rays: Observations, poses: Poses) -> float:

@@ -12,15 +12,15 @@ import pycolmap
 from rangesfm.arrays import Array, Indices
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
-from rangesfm.measurements.gravity import Upwards
-from rangesfm.measurements.lengths.cost import TapedLengths
+from rangesfm.measurements.gravity import UpwardDirection
+from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.cost import CLOCK, SHORT, anchors_at
+from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
 from rangesfm.measurements.ranges.errors.range_errors import Misfit, RangeErrors, misfits
-from rangesfm.measurements.ranges.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
-from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.covariance import JointCovariance
 from rangesfm.util.geometry.gravity import Gravity
@@ -81,12 +81,13 @@ def refine_with_ranges(
     ranges = ranges_of_map(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors, errors, options)
     if shared_errors_m is not None:
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
-    upwards = () if first_pose_is_fixed or gravity is None else (Upwards(gravity),)
-    measured = Measured((RadioLog(ranges), TapedLengths(tape), *upwards))
+    markers = tape.control().end_markers
+    at = MapToFit.of_model(metric, trajectory, options, markers, ranges.placed_anchors)
+    upward = () if first_pose_is_fixed or gravity is None else (UpwardDirection(gravity),)
     with at_most(num_threads):
         problem = map_problem(
             metric,
-            measured,
+            (*measured_by_radio(ranges, at), *taped_lengths(tape, at), *upward),
             trajectory,
             camera=camera,
             options=options,
@@ -94,9 +95,9 @@ def refine_with_ranges(
             is_refined=is_refined,
             num_threads=num_threads,
         )
-        rest = refine(problem, measured.markers)
+        rest = refine(problem)
         covariance = joint_errors(rest, 1.0) if options.covariance else None
-    return metric, summarize(rest, measured, covariance, 1.0)
+    return metric, summarize(rest, ranges, covariance, 1.0)
 
 
 @dataclass(frozen=True)
@@ -181,16 +182,15 @@ class RefineSummary:
 
 
 def summarize(
-    rest: MapAtRest, measured: Measured, covariance: JointCovariance | None, bending_factor: float
+    rest: MapAtRest, given: Ranges, covariance: JointCovariance | None, bending_factor: float
 ) -> RefineSummary:
     """Summarise a refinement.
 
     Args:
-        rest: the map at rest. measured: all that was measured, the log of a radio in it, which may be empty.
+        rest: the map at rest. given: all ranges of the log, which may be empty.
         covariance, bending_factor: as in the summary.
     """
-    [radio] = (source for source in measured.sources if isinstance(source, RadioLog))
-    ranges = ranges_of(rest.problem.kinds, radio.ranges)
+    ranges = ranges_of(rest.problem.kinds, given)
     state, solutions = rest.state, rest.solutions
     if not len(ranges.rows):
         state = replace(state, blocks={**ranges.blocks, **state.blocks})

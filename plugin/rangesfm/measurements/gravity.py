@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,7 +11,6 @@ import numpy as np
 from rangesfm import solver
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.kind import LEAST_SQUARES, Block, Linearization, MapState, Measurements, Weights
-from rangesfm.measurements.source import MapToFit, Source
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 
@@ -45,15 +44,3 @@ class UpwardDirection(Measurements):
         )
         solver.add_residual_block(adjustment.adjuster, cost, None, [poses[0]])
         return np.arange(first, adjustment.adjuster.problem.num_residuals())
-
-
-@dataclass(frozen=True)
-class Upwards(Source):
-    """The upward direction in the first camera of a map in a site."""
-
-    gravity: Gravity
-
-    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
-        """Yield the direction."""
-        del at
-        yield UpwardDirection(self.gravity)

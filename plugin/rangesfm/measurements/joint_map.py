@@ -16,7 +16,9 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.source import Source
+from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.points import MapToFit
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
@@ -179,10 +181,19 @@ class KindOnMap(Located):
         del on_map
         return {}
 
-    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
-        """Return the measurements for the fit of a map that may bend, given all that is measured in it as one piece."""
-        del on_map
-        return ()
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks in photos to which they refer in the fit of a map that may bend, by name."""
+        return {}
+
+    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+        """Yield them for the fit of a map that may bend, with the noise to begin with.
+
+        Args:
+            on_map: all that is measured in it as one piece. at: the map at the start of the fit.
+        """
+        del on_map, at
+        yield from ()
 
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.robust_statistics import RobustLoss
@@ -101,6 +102,16 @@ class Measurements(ABC):
     """Name of the kind."""
     counts_in_metres: ClassVar[bool] = False
     """Whether they say with what precision, in metres, the map is to be found; priors and directions do not."""
+
+    @property
+    def places_map(self) -> bool:
+        """Whether they place the map in the site."""
+        return False
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks in photos to which they refer, by name."""
+        return {}
 
     @property
     @abstractmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -12,8 +13,10 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.kind import Block, ByBlock, Linearization, MapState
 from rangesfm.measurements.lengths.markers import images_by_name
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.options import RefineOptions
+from rangesfm.util.geometry.poses import Poses, frames_in_order, model_poses
 from rangesfm.util.geometry.rotations import cross_matrices
-from rangesfm.util.geometry.trajectory import pose_of
+from rangesfm.util.geometry.trajectory import Trajectory, pose_of
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,13 @@ class NamedPoints:
         rays: for each marker the (k,) indices of the keyframes that see it, and the (k, 3) origins and directions in
             their rigs.
         anchors: names of anchors with a position.
+        markers: the markers, by name.
     """
 
     cameras: Mapping[str, tuple[int, Array]]
     rays: Mapping[str, tuple[Indices, Array, Array]]
     anchors: frozenset[str]
+    markers: Mapping[str, Marker]
 
     @classmethod
     def in_model(
@@ -75,7 +80,7 @@ class NamedPoints:
                 np.array([cameras[photo][1] for photo in names]).reshape(-1, 3),
                 directions / np.linalg.norm(directions, axis=1)[:, None],
             )
-        return cls(cameras, rays, frozenset(anchors))
+        return cls(cameras, rays, frozenset(anchors), markers)
 
     def __contains__(self, name: str) -> bool:
         return name in self.cameras or name in self.rays or name in self.anchors
@@ -91,6 +96,35 @@ class NamedPoints:
             if block in state.blocks:
                 return PlacedPoint(state.blocks[block], {}, (block,))
         return _where_rays_meet(*self.rays[name], state)
+
+
+class MapToFit(NamedTuple):
+    """A metric map at the start of its fit.
+
+    Attributes:
+        poses: of its frames, those of the trajectory first. points: named ones.
+        trajectory: of the unscaled model, to which the measurements refer.
+        options: of the fit.
+    """
+
+    poses: Poses
+    points: NamedPoints
+    trajectory: Trajectory
+    options: RefineOptions
+
+    @classmethod
+    def of_model(
+        cls,
+        model: pycolmap.Reconstruction,
+        trajectory: Trajectory,
+        options: RefineOptions,
+        markers: Mapping[str, Marker],
+        anchors: Iterable[str],
+    ) -> MapToFit:
+        """Return a metric model with its points; others as of the map, and of ``NamedPoints.in_model``."""
+        frame_ids = frames_in_order(model, trajectory.frame_ids)
+        points = NamedPoints.in_model(model, frame_ids, markers, anchors)
+        return cls(model_poses(model, frame_ids), points, trajectory, options)
 
 
 def _where_rays_meet(frames: Indices, origins: Array, directions: Array, state: MapState) -> PlacedPoint:

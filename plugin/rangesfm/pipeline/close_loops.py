@@ -116,7 +116,7 @@ def close_loops_of_models(
                 raise GeometryError(why_not)
             with journal.stage("refinement"):
                 path = trajectory_from_reconstruction(models[0])
-                at_rest = refine(_problem(survey, path, models[0], is_refined=False), {})
+                at_rest = refine(_problem(survey, path, models[0], is_refined=False))
             start = _UnscaledMap(survey, journal, matching, path, at_rest)
             if start.finder is None:
                 raise GeometryError("the covariance of the poses is not known")
@@ -259,7 +259,7 @@ class _UnscaledMap(_MatchedMap):
 
     def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _UnscaledMap | None:
         problem = _problem(self.survey, self.trajectory, self.model, is_refined=True)
-        rest = refine_with_loops(problem, problem, {}, loops, merge)
+        rest = refine_with_loops(problem, problem, loops, merge)
         return None if rest is None else replace(self, at_rest=rest)
 
     def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
@@ -275,7 +275,6 @@ def _problem(survey: Survey, path: Trajectory, model: pycolmap.Reconstruction, *
         survey.camera,
         survey.refine,
         first_pose_is_fixed=True,
-        is_placed=False,
         num_threads=survey.mapper.num_threads,
         is_refined=is_refined,
     )

@@ -17,13 +17,12 @@ from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refi
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
-from rangesfm.measurements.source import Measured
 from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map, ranges_in_map
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
@@ -40,10 +39,10 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     run = _with_open_clock(run, metric)
-    measured = _measured(run, metric)
     with at_most(run.survey.mapper.num_threads):
-        problem = _problem(run, metric, measured, is_refined=is_refined_model(run.survey.images.model))
-        return _finished(run, metric, measured, refine(problem, measured.markers))
+        return _finished(
+            run, metric, refine(_problem(run, metric, is_refined=is_refined_model(run.survey.images.model)))
+        )
 
 
 def refine_closed_map(
@@ -58,13 +57,12 @@ def refine_closed_map(
         SolverError: as for ``refine_map``.
     """
     run = _with_open_clock(run, metric)
-    measured = _measured(run, metric)
     assert metric.kept is not None, "a refined map"
     with at_most(run.survey.mapper.num_threads):
-        problem = _problem(run, metric, measured, is_refined=True)
+        problem = _problem(run, metric, is_refined=True)
         known = problem.like(replace(problem, kinds=metric.kept.kinds))
-        rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
-        return None if rest is None else _finished(run, metric, measured, rest)
+        rest = refine_with_loops(problem, known, loops, merge_tracks)
+        return None if rest is None else _finished(run, metric, rest)
 
 
 def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
@@ -75,32 +73,28 @@ def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
     return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
 
 
-def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
-    """Return all that was measured of a scaled map."""
-    estimate = metric.estimate.with_anchors(metric.anchors)
-    return measured_in_map(_inputs(run, metric), run.survey, estimate, metric.trajectory)
-
-
 def _inputs(run: SurveyRun, metric: MetricResult) -> RangingInputs:
     """Return the inputs without those that contradict all else."""
     return replace(run.inputs, tape=metric.tape, positions=metric.positions)
 
 
-def _problem(run: SurveyRun, metric: MetricResult, measured: Measured, *, is_refined: bool) -> MapProblem:
-    survey = run.survey
+def _problem(run: SurveyRun, metric: MetricResult, *, is_refined: bool) -> MapProblem:
+    """Return the problem of a copy of the map and all that was measured of it."""
+    survey, path, model = run.survey, metric.trajectory, pycolmap.Reconstruction(metric.final)
+    estimate = metric.estimate.with_anchors(metric.anchors)
     return map_problem(
-        pycolmap.Reconstruction(metric.final),
-        measured,
-        metric.trajectory,
+        model,
+        measured_in_map(_inputs(run, metric), survey, estimate, path, model),
+        path,
         camera=survey.camera,
         options=survey.refine,
-        first_pose_is_fixed=metric.estimate.frame != "site",
+        first_pose_is_fixed=estimate.frame != "site",
         is_refined=is_refined,
         num_threads=survey.mapper.num_threads,
     )
 
 
-def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> MetricResult:
+def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricResult:
     """Learn the errors at a map at rest, and return it as a result with its covariance."""
     options, on_map, factor = run.survey.refine, metric.estimate.on_map, 1.0
     if on_map.kinds:  # else nothing is known of the scale's error
@@ -121,7 +115,8 @@ def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: Ma
             )
     model, path = rest.problem.metric, metric.trajectory
     model.update_point_3d_errors()
-    summary = summarize(rest, measured, covariance, factor)
+    given = ranges_in_map(run.inputs, metric.estimate.with_anchors(metric.anchors), path, options)
+    summary = summarize(rest, given, covariance, factor)
     broken = why_broken(metric.scaled, model, path, metric.estimate, summary, options.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(

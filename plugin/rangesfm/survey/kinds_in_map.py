@@ -11,27 +11,27 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.gravity import Upwards
+from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
 from rangesfm.measurements.joint_map import KindOnMap, Located, find_kind, upward_by
-from rangesfm.measurements.kind import Block
-from rangesfm.measurements.lengths.cost import TapedLengths
+from rangesfm.measurements.kind import Block, Measurements
+from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances, surveyed_distances
+from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.cost import Ranges
-from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
+from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
-from rangesfm.measurements.source import Measured
 from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
@@ -166,21 +166,26 @@ def without_contradicted(inputs: RangingInputs, kinds: Sequence[KindOnMap]) -> R
     return replace(inputs, tape=tape, positions=known)
 
 
-def measured_in_map(inputs: RangingInputs, survey: Survey, estimate: ScaleEstimate, path: Trajectory) -> Measured:
+def measured_in_map(
+    inputs: RangingInputs, survey: Survey, estimate: ScaleEstimate, path: Trajectory, model: pycolmap.Reconstruction
+) -> tuple[Measurements, ...]:
     """Return all that was measured of a scaled map, for the fit of a map that may bend.
 
     Args:
         inputs: without those that contradict all else. estimate: of the scale. path: of the unscaled model.
+        model: the map, metres.
     """
-    tape, gravity, on_map = inputs.tape, gravity_of(survey.scale.up_in_first_camera), estimate.on_map
+    tape, gravity, on_map = inputs.tape.control(), gravity_of(survey.scale.up_in_first_camera), estimate.on_map
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    of_kinds = (source for kind in on_map.kinds for source in kind.sources(on_map))
+    ranges, options = ranges_in_map(inputs, estimate, path, survey.refine), survey.refine
+    markers = tape.end_markers | {name: of for kind in on_map.kinds for name, of in kind.markers.items()}
+    at = MapToFit.of_model(model, path, options, markers, ranges.placed_anchors)
+    of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, at))
     upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
-    levelled = () if upward is None else (Upwards(upward),)
-    ranges = ranges_in_map(inputs, estimate, path, survey.refine)
-    return Measured((RadioLog(ranges), TapedLengths(tape), *of_kinds, *levelled))
+    levelled = () if upward is None else (UpwardDirection(upward),)
+    return (*measured_by_radio(ranges, at), *taped_lengths(tape, at), *of_kinds, *levelled)
 
 
 def ranges_in_map(inputs: RangingInputs, estimate: ScaleEstimate, path: Trajectory, options: RefineOptions) -> Ranges:

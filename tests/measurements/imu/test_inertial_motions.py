@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 import pycolmap
@@ -15,13 +17,14 @@ from rangesfm.estimation.drift import carry_model
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
 from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialState
-from rangesfm.measurements.imu.inertial_motions import GRAVITY, SCALE_ERRORS, InertialLog
+from rangesfm.measurements.imu.inertial_motions import GRAVITY, SCALE_ERRORS, motions_on_map
 from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, SensorPrior
-from rangesfm.measurements.source import Measured, Source
+from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.points import MapToFit
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.poses import Poses
@@ -54,10 +57,12 @@ def drift(made: SyntheticModel) -> tuple[Poses, Poses]:
     return true, drifted
 
 
-def refined(metric: pycolmap.Reconstruction, path: Trajectory, sources: tuple[Source, ...]) -> MapAtRest:
+def refined(
+    metric: pycolmap.Reconstruction, path: Trajectory, measured: Callable[[MapToFit], Measurements]
+) -> MapAtRest:
     problem = map_problem(
         metric,
-        Measured(sources),
+        (measured(MapToFit.of_model(metric, path, RefineOptions(), {}, ())),),
         path,
         camera=CameraOptions(refine_intrinsics=False),
         options=RefineOptions(),
@@ -65,7 +70,7 @@ def refined(metric: pycolmap.Reconstruction, path: Trajectory, sources: tuple[So
         is_refined=False,
         num_threads=1,
     )
-    return refine(problem, {})
+    return refine(problem)
 
 
 def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
@@ -86,8 +91,8 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
     gravity = GRAVITY_M_S2 * exponentials(np.array([[0.03, -0.02, 0.0]]))[0] @ DOWN
     state = InertialState(1.0, np.zeros((num, 3)), gravity, np.zeros(NUM_OF_SENSOR), MOUNTING, np.ones(num))
     covariance = intervals.covariance(np.array([2e-4, 3e-3]))
-    source = InertialLog(InertialProblem(log, path, MOUNTING, PRIOR), state, intervals, covariance)
-    rest = refined(made.reconstruction, path, (source,))
+    problem = InertialProblem(log, path, MOUNTING, PRIOR)
+    rest = refined(made.reconstruction, path, lambda at: motions_on_map(problem, state, intervals, covariance, at))
     assert rmse(drifted.centers - true.centers) > 0.1
     assert rest.converged
     np.testing.assert_allclose(rest.state.poses.centers, true.centers, atol=1e-6)
@@ -104,7 +109,8 @@ def test_drift_of_scale_and_tilt_is_gone_and_what_is_left_is_as_large_as_said(se
     path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
     sensor = scale_by_sensor(InertialProblem(log, path, MOUNTING, PRIOR), WalkBending(path))
     placed = sensor.alone.estimate
-    rest = refined(rescale(made.reconstruction, placed), path, sensor.sources(sensor.alone))
+    metric = rescale(made.reconstruction, placed)
+    rest = refined(metric, path, lambda at: next(sensor.measurements(sensor.alone, at)))
     poses, errors = rest.state.poses, joint_errors(rest, 1.0)
     assert errors is not None
     in_first = (true.centers - true.centers[0]) @ true.world_from_rig[0]

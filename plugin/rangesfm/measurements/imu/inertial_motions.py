@@ -24,8 +24,8 @@ from rangesfm.measurements.kind import (
     Measurements,
     Weights,
 )
+from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.prior import Prior
-from rangesfm.measurements.source import MapToFit, Source
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
 from rangesfm.util.geometry.rotations import left_jacobians, logarithms
@@ -234,52 +234,44 @@ def _length_and_direction(vector: Array) -> tuple[float, Array]:
     return length, vector / length
 
 
-@dataclass(frozen=True)
-class InertialLog(Source):
-    """A log that was summed up between the photos of a map, with a state to start from.
+def motions_on_map(
+    problem: InertialProblem, state: InertialState, intervals: Preintegrated, covariance: Array, at: MapToFit
+) -> InertialMotions:
+    """Return the motions of a log with the noise that they show on a map as it is given, which may bend.
 
-    Attributes:
-        problem: the log on the path. state: in the metric world.
-        intervals: the log summed up. covariance: (k, 9, 9) of their errors.
+    Biases are constant in stretches of time in which they walk by less than the white noise of their mean.
+
+    Args:
+        problem: the log on the path. state: to start from, in the metric world.
+        intervals: the log summed up between the photos. covariance: (k, 9, 9) of their errors.
     """
-
-    problem: InertialProblem
-    state: InertialState
-    intervals: Preintegrated
-    covariance: Array
-
-    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
-        """Yield the motions with the noise that they show on the map as it is given, which may bend.
-
-        Biases are constant in stretches of time in which they walk by less than the white noise of their mean.
-        """
-        problem, state, photo = self.problem, self.state, self.intervals.before
-        prior, before, now, times_s = problem.prior, problem.mounting, state.mounting, problem.times_s[photo]
-        longest_s = min(noise.median / walk.median for noise, walk in zip(prior.noise, prior.walk, strict=True))
-        _, stretch = np.unique((times_s - times_s[0]) // longest_s, return_inverse=True)
-        middles_s = np.bincount(stretch, times_s) / np.bincount(stretch)
-        photos = np.union1d(photo, self.intervals.after).tolist()
-        start = {velocity_block(k): state.velocities_m_s[k] for k in photos}
-        start |= {bias_block(k): state.sensor[BIASES] for k in range(len(middles_s))}
-        start |= {
-            GRAVITY: state.gravity_m_s2,
-            SCALE_ERRORS: state.sensor[SCALES],
-            CROSS_AXES: state.sensor[ACCEL_CROSS],
-            CLOCK: state.sensor[LATE],
-        }
-        turn = logarithms((before.rig_from_imu.T @ now.rig_from_imu)[None])[0]
-        start[MOUNTING] = np.concatenate([turn, now.imu_in_rig_m])
-        motions = InertialMotions(
-            self.intervals,
-            np.linalg.inv(np.linalg.cholesky(self.covariance)),
-            stretch,
-            np.sqrt(np.diff(middles_s))[:, None] * np.repeat([walk.median for walk in prior.walk], 3),
-            before,
-            prior,
-            start,
-            RobustLoss(at.options.range_loss_scale, is_bounded=True),
-        )
-        yield motions.with_noise_of(motions.linearize(MapState(at.poses, start)).residual, 0.0)
+    photo = intervals.before
+    prior, before, now, times_s = problem.prior, problem.mounting, state.mounting, problem.times_s[photo]
+    longest_s = min(noise.median / walk.median for noise, walk in zip(prior.noise, prior.walk, strict=True))
+    _, stretch = np.unique((times_s - times_s[0]) // longest_s, return_inverse=True)
+    middles_s = np.bincount(stretch, times_s) / np.bincount(stretch)
+    photos = np.union1d(photo, intervals.after).tolist()
+    start = {velocity_block(k): state.velocities_m_s[k] for k in photos}
+    start |= {bias_block(k): state.sensor[BIASES] for k in range(len(middles_s))}
+    start |= {
+        GRAVITY: state.gravity_m_s2,
+        SCALE_ERRORS: state.sensor[SCALES],
+        CROSS_AXES: state.sensor[ACCEL_CROSS],
+        CLOCK: state.sensor[LATE],
+    }
+    turn = logarithms((before.rig_from_imu.T @ now.rig_from_imu)[None])[0]
+    start[MOUNTING] = np.concatenate([turn, now.imu_in_rig_m])
+    motions = InertialMotions(
+        intervals,
+        np.linalg.inv(np.linalg.cholesky(covariance)),
+        stretch,
+        np.sqrt(np.diff(middles_s))[:, None] * np.repeat([walk.median for walk in prior.walk], 3),
+        before,
+        prior,
+        start,
+        RobustLoss(at.options.range_loss_scale, is_bounded=True),
+    )
+    return motions.with_noise_of(motions.linearize(MapState(at.poses, start)).residual, 0.0)
 
 
 def velocity_block(photo: int) -> Block:

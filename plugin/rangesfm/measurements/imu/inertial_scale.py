@@ -21,7 +21,7 @@ from rangesfm.measurements.imu.inertial_fit import (
     InertialState,
     Sizes,
 )
-from rangesfm.measurements.imu.inertial_motions import InertialLog
+from rangesfm.measurements.imu.inertial_motions import motions_on_map
 from rangesfm.measurements.imu.preintegration import (
     ACCEL,
     ACCEL_BIAS,
@@ -35,8 +35,9 @@ from rangesfm.measurements.imu.preintegration import (
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.errors.components import component_words
-from rangesfm.measurements.source import Source
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.mistakes import MistakeTests
@@ -154,8 +155,8 @@ class InertialScale(KindOnMap):
                 "move it to and fro and turn it about all axes, for half a minute or longer",
             )
 
-    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
-        """Return the log between the photos of the map, which may bend."""
+    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+        """Yield the motions between the photos of a map that may bend."""
         state, placed, sizes = self.state, on_map.estimate, self.sizes
         in_world = replace(
             state,
@@ -165,7 +166,7 @@ class InertialScale(KindOnMap):
         late = sizes["photo_times"] * self.problem.linearized(state, self.intervals).late[..., 0]
         densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
         covariance = self.intervals.covariance(densities) + late @ np.swapaxes(late, 1, 2)
-        return (InertialLog(self.problem, in_world, self.intervals, covariance),)
+        yield motions_on_map(self.problem, in_world, self.intervals, covariance, at)
 
     def entry(self, on_map: JointMap) -> Mapping[str, object]:
         """Return what ``ImuEntry`` has."""

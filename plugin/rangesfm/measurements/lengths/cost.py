@@ -22,9 +22,8 @@ from rangesfm.measurements.kind import (
 )
 from rangesfm.measurements.lengths.markers import images_by_name, variance_along
 from rangesfm.measurements.lengths.tape import Marker, Tape
-from rangesfm.measurements.points import NamedPoints, linearized
+from rangesfm.measurements.points import MapToFit, NamedPoints, linearized
 from rangesfm.measurements.prior import Prior
-from rangesfm.measurements.source import MapToFit, Source
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss
 from rangesfm.util.geometry.trajectory import pose_of
@@ -58,6 +57,10 @@ class Lengths(Measurements):
     beyond_m2: Mapping[str, Array]
     bias_stddev_m: float = 0.0
     loss: RobustLoss = LEAST_SQUARES
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        return {name: self.points.markers[name] for of in self.ends for name in of if name in self.points.markers}
 
     @property
     def blocks(self) -> Mapping[Block, Array]:
@@ -168,26 +171,9 @@ def _origin(name: str) -> Block:
     return "rig origin", name
 
 
-@dataclass(frozen=True)
-class TapedLengths(Source):
-    """Lengths that were taped, between what the photos show or between anchors, of which the control ones take part."""
-
-    tape: Tape
-
-    @property
-    def markers(self) -> Mapping[str, Marker]:
-        """Marks of the lengths' ends."""
-        ends = {name for taped in self.tape.control().distances for name in taped.ends}
-        return {name: marker for name, marker in self.tape.markers.items() if name in ends}
-
-    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
-        """Yield the lengths whose ends are in the map, if there are any."""
-        taped = [each for each in self.tape.control().distances if all(name in at.points for name in each.ends)]
-        if taped:
-            yield Lengths(
-                tuple(each.ends for each in taped),
-                at.points,
-                np.array([each.distance_m for each in taped]),
-                np.array([each.stddev_m for each in taped]),
-                {},
-            )
+def taped_lengths(tape: Tape, at: MapToFit) -> Iterator[Lengths]:
+    """Yield the control lengths of a tape whose ends are in a map, if there are any."""
+    taped = [each for each in tape.control().distances if all(name in at.points for name in each.ends)]
+    if taped:
+        ends, lengths_m = tuple(each.ends for each in taped), np.array([each.distance_m for each in taped])
+        yield Lengths(ends, at.points, lengths_m, np.array([each.stddev_m for each in taped]), {})

@@ -27,8 +27,7 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
     """Return the position (3,) of each marker that is an end of a length, by name; errors like ``locate_distances``."""
-    images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
-    wanted = {name: marker for name, marker in tape.markers.items() if name in ends}
+    images, wanted = images_by_name(model), tape.end_markers
     return {name: triangulate_marker(name, marker, images, tape.markers_path) for name, marker in wanted.items()}
 
 

@@ -82,6 +82,12 @@ class Tape:
         return replace(self, distances=tuple(taped for taped in self.distances if taped.kind == CONTROL))
 
     @property
+    def end_markers(self) -> dict[str, Marker]:
+        """Markers that are ends of lengths, by name."""
+        ends = {name for taped in self.distances for name in taped.ends}
+        return {name: marker for name, marker in self.markers.items() if name in ends}
+
+    @property
     def found_markers(self) -> dict[str, Marker]:
         """Markers that were found in photos, not set by hand."""
         return {name: marker for name, marker in self.markers.items() if marker.stddev_px == FOUND_STDDEV_PX}

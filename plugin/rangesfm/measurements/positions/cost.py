@@ -1,23 +1,39 @@
-"""Known positions of an antenna on the camera, as measurements of the map."""
+"""Known positions in a site as measurements of the map: of an antenna on the camera, and of points that photos show."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
 from rangesfm import solver
 from rangesfm.arrays import Array, Indices, rows_by_key
-from rangesfm.measurements.kind import Block, ByBlock, LearntErrors, Linearization, MapState, Measurements, Weights
+from rangesfm.measurements.kind import (
+    LEAST_SQUARES,
+    Block,
+    ByBlock,
+    LearntErrors,
+    Linearization,
+    MapState,
+    Measurements,
+    Weights,
+)
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
-from rangesfm.measurements.positions.known_positions import LearntPositions
+from rangesfm.measurements.points import MapToFit, NamedPoints, linearized
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.known_positions import KnownPositions, LearntPositions
 from rangesfm.measurements.prior import Prior
-from rangesfm.measurements.ranges.errors.noise import correlation_inflation
+from rangesfm.measurements.ranges.errors.noise import STRETCH_S, correlation_inflation, stretch_labels
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
+from rangesfm.util.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 ARM: Block = ("lever_arm", "positions")
 CLOCK: Block = ("clock", "positions")
@@ -60,6 +76,41 @@ class AntennaPositions(Measurements):
     factor: float = 1.0
     inflation: float = 1.0
     learnt: LearntPositions | None = None
+
+    @classmethod
+    def on_map(
+        cls, known: KnownPositions, rows: Indices, stddev_m: Array, site_from_model: Similarity, track: AntennaTrack,
+        at: MapToFit,
+    ) -> AntennaPositions:  # fmt: skip
+        """Return positions on a map that is to be fitted.
+
+        Args:
+            known: in the unscaled model. rows: (k,) of the antenna's that take part.
+            stddev_m: (k,) standard deviations of a coordinate. site_from_model: the estimate. track: of the antenna.
+        """
+        trajectory, arm_m = at.trajectory, np.array(track.antenna_in_cam_m, np.float64)
+        (before, after), fraction = known.on_path[rows].T, known.fraction[rows]
+        turned = trajectory.world_from_cam @ arm_m
+        on_line = (1 - fraction)[:, None] * turned[before] + fraction[:, None] * turned[after]
+        beyond = site_from_model.scale * known.from_line[rows] + known.arms_m[rows] - on_line
+        times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
+        stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
+        return cls(
+            tuple(known.names[row] for row in rows.tolist()),
+            AntennaPlaces(before, after, fraction, times[after] - times[before], beyond @ site_from_model.rotation.T),
+            known.position_m[rows],
+            _whitenings(known.covariance_m2[rows], stddev_m),
+            stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / stddev_m, 0.0),
+            group=stretch_labels(known.time_s[rows], STRETCH_S),
+            arm_m=arm_m,
+            arm_stddev_m=at.options.lever_arm_stddev_m,
+            clock_stddev_s=track.offset_stddev_s,
+            loss=RobustLoss(at.options.range_loss_scale, is_bounded=True),
+        )
+
+    @property
+    def places_map(self) -> bool:
+        return True
 
     @property
     def blocks(self) -> Mapping[Block, Array]:
@@ -175,3 +226,65 @@ class AntennaPositions(Measurements):
 
     def log_likelihood(self, residual: Array) -> float:
         return -residual.size * float(np.log(max(self._shown(residual, 0.0), 1e-300)))
+
+
+def _whitenings(covariances_m2: Array, stddevs_m: Array) -> Array:
+    """Return (k, 3, 3) whitenings of covariances as given, but of these mean standard deviations (k,)."""
+    given = np.isfinite(covariances_m2[:, :1, :1])
+    shapes = np.where(given, covariances_m2, np.eye(3))
+    shapes = shapes / (np.trace(shapes, axis1=1, axis2=2) / 3)[:, None, None]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(shapes * stddevs_m[:, None, None] ** 2)))
+
+
+@dataclass(frozen=True)
+class MarkedPositions(Measurements):
+    """k marked points with known coordinates.
+
+    Attributes:
+        names: of their markers. points: to which they belong.
+        position_m: (k, 3) in the metric world. stddev_m: (k,) of each coordinate.
+        beyond_m2: covariance (3, 3) of errors of marks that no residual has, by name.
+    """
+
+    kind: ClassVar[str] = "control point"
+    counts_in_metres: ClassVar[bool] = True
+
+    names: tuple[str, ...]
+    points: NamedPoints
+    position_m: Array
+    stddev_m: Array
+    beyond_m2: Mapping[str, Array]
+
+    @property
+    def places_map(self) -> bool:
+        return True
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        return {name: self.points.markers[name] for name in self.names}
+
+    @property
+    def _covariance_m2(self) -> Array:
+        beyond_m2 = np.array([self.beyond_m2.get(name, np.zeros((3, 3))) for name in self.names])
+        return np.asarray(self.stddev_m[:, None, None] ** 2 * np.eye(3) + beyond_m2)
+
+    @property
+    def weights(self) -> Weights:
+        roots = np.linalg.inv(np.linalg.cholesky(self._covariance_m2))
+        return Weights(roots, np.ones(len(self.names)), LEAST_SQUARES)
+
+    def linearize(self, state: MapState) -> Linearization:
+        placed = [self.points.at(name, state) for name in self.names]
+        residuals = [point.position_m - at for point, at in zip(placed, self.position_m, strict=True)]
+        return linearized(residuals, [[(np.eye(3), point)] for point in placed])
+
+    def with_errors_of_marks(self, beyond_m2: Mapping[str, Array]) -> Self:
+        return replace(self, beyond_m2=beyond_m2)
+
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+        first = adjustment.adjuster.problem.num_residuals()
+        for row, name in enumerate(self.names):
+            further = self.beyond_m2.get(name, np.zeros((3, 3))) / adjustment.pixel_stddev**2
+            stddev = self.stddev_m[row] / adjustment.pixel_stddev
+            solver.add_normal_prior(adjustment.adjuster, blocks["mark", name], self.position_m[row], stddev, further)
+        return np.arange(first, adjustment.adjuster.problem.num_residuals())

@@ -16,7 +16,10 @@ from scipy import special
 from rangesfm.arrays import Array, Indices, Mask, median, rms
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
-from rangesfm.measurements.lengths.tape import LEFT_OUT
+from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.lengths.tape import LEFT_OUT, Marker
+from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.grouped_positions import (
     POSITIONS,
     GroupedPositions,
@@ -32,11 +35,9 @@ from rangesfm.measurements.positions.known_positions import (
     LearntPositions,
 )
 from rangesfm.measurements.positions.position_tests import tests_of_positions
-from rangesfm.measurements.positions.site_positions import UsedPositions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
-from rangesfm.measurements.source import Source
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
 from rangesfm.solver.mistakes import MistakeTests
@@ -132,12 +133,24 @@ class PositionScale(KindOnMap):
             "antenna_in_cam_m": np.array(track.antenna_in_cam_m).tolist(),
         }
 
-    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
-        """Return the positions that take part in the fit."""
-        antenna, markers = self.surveyed.antenna, self.surveyed.markers
-        track = () if antenna is None else (antenna,)
-        stddevs_m = self.stddevs_m(on_map)
-        return (UsedPositions(self.known, self.takes_part, stddevs_m, on_map.estimate, markers, track),)
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the control points that take part."""
+        names = (self.known.names[row] for row in np.flatnonzero(self.takes_part & self.known.is_mark).tolist())
+        return {name: self.surveyed.markers[name] for name in names}
+
+    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+        """Yield the control points that take part, and the positions of the antenna.
+
+        Outliers of an antenna are left to the loss, because on a map that is one piece drift looks like them.
+        """
+        known, track, stddev_m = self.known, self.surveyed.antenna, self.stddevs_m(on_map)
+        marks, others = (np.flatnonzero(self.takes_part & of_kind) for of_kind in (known.is_mark, ~known.is_mark))
+        if len(marks):
+            names = tuple(known.names[row] for row in marks.tolist())
+            yield MarkedPositions(names, at.points, known.position_m[marks], stddev_m[marks], {})
+        if track is not None and len(others):
+            yield AntennaPositions.on_map(known, others, stddev_m[others], on_map.estimate, track, at)
 
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock."""

@@ -66,6 +66,15 @@ class Ranges(Measurements):
         return self.observations.placed_rows
 
     @property
+    def places_map(self) -> bool:
+        return any(np.isfinite(each.prior_position_stddev_m) for each in self.anchors)
+
+    @property
+    def placed_anchors(self) -> tuple[str, ...]:
+        """Names of the anchors with a position."""
+        return tuple(each.anchor_id for each in self.anchors if np.isfinite(each.position_m).all())
+
+    @property
     def is_heard(self) -> npt.NDArray[np.bool_]:
         """(m,) anchors to which ranges take part."""
         return np.isin(np.arange(len(self.anchors)), self.observations.log.anchor_index[self.rows])

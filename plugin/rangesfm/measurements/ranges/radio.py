@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths.cost import Lengths
-from rangesfm.measurements.points import NamedPoints
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges, antenna_places
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.source import MapToFit, Source
 from rangesfm.options import RefineOptions
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -52,30 +50,13 @@ def ranges_of_map(
     )
 
 
-@dataclass(frozen=True)
-class RadioLog(Source):
-    """The ranges of a log on a metric map."""
-
-    ranges: Ranges
-
-    @property
-    def placed_points(self) -> Iterable[str]:
-        """Names of the anchors with a position."""
-        return (each.anchor_id for each in self.ranges.anchors if np.isfinite(each.position_m).all())
-
-    @property
-    def places_map(self) -> bool:
-        """True if anchors are surveyed."""
-        return any(np.isfinite(each.prior_position_stddev_m) for each in self.ranges.anchors)
-
-    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
-        """Yield the ranges to anchors, and the lengths between anchors, if there are any."""
-        ranges = self.ranges
-        if len(ranges.rows):
-            ranges = ranges.begun(MapState(at.poses, ranges.blocks))
-            yield ranges
-        if len((by_radio := _between_anchors(ranges, at.points)).ends):
-            yield by_radio
+def measured_by_radio(ranges: Ranges, at: MapToFit) -> Iterator[Measurements]:
+    """Yield the ranges of a log to anchors on a metric map, and the lengths between anchors, if there are any."""
+    if len(ranges.rows):
+        ranges = ranges.begun(MapState(at.poses, ranges.blocks))
+        yield ranges
+    if len((by_radio := _between_anchors(ranges, at.points)).ends):
+        yield by_radio
 
 
 def _between_anchors(ranges: Ranges, points: NamedPoints) -> Lengths:

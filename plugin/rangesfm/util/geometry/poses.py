@@ -35,6 +35,11 @@ def relative_poses(poses: Poses, reference: Indices, frame: Indices) -> tuple[Ar
     return to_reference @ poses.world_from_rig[frame], shift
 
 
+def frames_in_order(metric: pycolmap.Reconstruction, first_ids: Indices) -> Indices:
+    """Return the ids of all frames of a model with a pose: given ones, then the others."""
+    return np.concatenate([first_ids, np.setdiff1d(np.array(metric.reg_frame_ids(), dtype=np.int64), first_ids)])
+
+
 def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Poses:
     """Return the poses of the given frames."""
     rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
