@@ -42,8 +42,7 @@ def test_every_figure_has_its_pictures_with_something_on_them(make_result: MakeR
 def test_texts_beside_rows_stand_beside_the_panel_in_each_of_several_panels(make_result: MakeResult) -> None:
     """The texts on the right of a row once stood on its bar."""
     content = Content(read_result_folder(make_result(num_keyframes=20, num_ranges_per_anchor=20)))
-    figure = mistakes_figure(content)
-    assert figure is not None
+    (figure,) = mistakes_figure(content)
     for panel in figure_spec(figure)["concat"]:
         texts = [layer for layer in panel["layer"] if layer["mark"]["type"] == "text"]
         sides = {layer["mark"]["align"]: (layer["encoding"]["x"]["value"], layer["mark"]["dx"]) for layer in texts}

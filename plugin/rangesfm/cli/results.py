@@ -235,7 +235,7 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     if args.images is not None and not args.images.is_dir():
         raise InputError("no such folder of photos", args.images)
     pictures, labels = write_report_pictures if args.png else lambda _: (), survey_from_arguments(args).report
-    page = write_report(source, images_path=args.images, title=labels.title, by=labels.by)
+    page = write_report(source, images_path=args.images, title=labels.title or "", by=labels.by or "")
     written = [str(page), *map(str, pictures(source))]
     result = read_result_folder(source)
     recorded = result.summary.settings.images.path

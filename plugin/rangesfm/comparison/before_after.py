@@ -112,7 +112,7 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> str
         tables.append(format_table(rows, result.summary.frame))
     if refined is not None:
         ranges = result.read(RangesAsUsed)
-        both = [] if ranges is None else [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
+        both = [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
         known = np.isfinite(both).all(axis=0)
         residuals_m = (both[0][known], both[1][known]) if len(both) == 2 and known.any() else None
         tables.append(str(compare_models(scaled, refined, range_residuals_m=residuals_m)))

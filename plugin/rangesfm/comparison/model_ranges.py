@@ -60,7 +60,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         metric_path: path of the final model of the run.
     """
     ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
-    if ranges is None:
+    if not ranges:
         return None
     before, after, has_place = ranges.places_on(metric_path.image_names)
     rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))

@@ -112,7 +112,6 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
     path_in_result(reconstruction, result)  # raises an error where no photo has a time: the trajectory would be empty
-    covariances = result.read(CenterCovariances)
     return MetricMap(
         reconstruction,
         timestamps_s=result.timestamps_s,
@@ -124,5 +123,5 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         is_site=summary.frame == "site",
         upward=None if summary.up is None else summary.up[0],
         georeference=None if summary.georeference is None else summary.georeference.georeference,
-        center_covariance_m2={} if covariances is None else covariances.by_photo_m2,
+        center_covariance_m2=result.read(CenterCovariances).by_photo_m2,
     )

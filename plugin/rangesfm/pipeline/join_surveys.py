@@ -103,7 +103,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _read(name: str, result: ResultFolder) -> FinishedRun:
     model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
-    if ranges is None:
+    if not ranges:
         raise InputError("has no ranges.csv: surveys are joined through anchors, so each needs ranges", result.path)
     path = path_in_result(model, result)
     if not is_one_after_the_other(path):

@@ -50,7 +50,7 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     """
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
-    used, imu = () if ranges is None else np.array(ranges.anchor_id, dtype=str)[ranges.is_used], folder.summary.imu
+    used, imu = np.array(ranges.anchor_id, dtype=str)[ranges.is_used], folder.summary.imu
     if model is None:
         raise InputError("has no metric model, expected a finished result", path)
     if not len(used) and imu is None:
@@ -60,7 +60,7 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
         expected = "expected the result of one survey"
         raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)
     sensor = None if imu is None else PlannedSensor(gyro_noise=imu.gyro_noise, accel_noise=imu.accel_noise)
-    (arm,) = np.zeros((1, 3)) if ranges is None else folder.lever_arms_m(ranges.tag_id[:1])
+    (arm,) = folder.lever_arms_m(ranges.tag_id[:1]) if ranges else np.zeros((1, 3))
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
     heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used)}
     anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]

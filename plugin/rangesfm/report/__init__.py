@@ -14,16 +14,14 @@ from rangesfm.util.files.contents import AnyPath
 __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 
 
-def write_report(
-    result_folder: AnyPath, *, images_path: AnyPath | None = None, title: str | None = None, by: str | None = None
-) -> Path:
+def write_report(result_folder: AnyPath, *, images_path: AnyPath | None = None, title: str = "", by: str = "") -> Path:
     """Write ``report.html`` into the output folder of a run.
 
     Args:
         result_folder: must hold ``result.json``. ``ranges.csv``, ``images.csv``, ``reference.csv`` (in the frame of the
             map) and the models are shown where they are there.
         images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result folder.
-        title, by: title of the page, and who made the survey; None: those that the run was given.
+        title, by: title of the page, and who made the survey; empty: those that the run was given.
 
     Returns:
         Path of the page.

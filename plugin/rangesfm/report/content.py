@@ -14,10 +14,10 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.export.metric_map import colored_points
 from rangesfm.result.model_path import path_in_result
-from rangesfm.result.result_folder import ResultFolder
+from rangesfm.result.result_folder import MODEL_NAMES, ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.folders import real_path
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1
@@ -40,15 +40,15 @@ class CameraIntrinsics:
 
 
 class Content:
-    """Everything that a report shows of a result folder; parts that the folder lacks are None or empty.
+    """Everything that a report shows of a result folder; parts that the folder lacks are empty.
 
     Attributes:
         title: as given, or the name of the folder; where that is the default one, of the survey folder around it.
-        by: who made the survey; None where nobody said it.
+        by: who made the survey.
         summary: content of ``result.json``; ``result`` reads the tables beside it.
         images_path: folder of the photos; None where it is not known.
-        ranges: content of ``ranges.csv``; None without ranges.
-        tags_in_cam_m: (n, 3) lever arm of each range's tag, in the camera frame; n is 0 without ranges.
+        ranges: content of ``ranges.csv``, n rows.
+        tags_in_cam_m: (n, 3) lever arm of each range's tag, in the camera frame.
         range_times_s: (n,) time of each range, or of its photo, in seconds since the first; NaN where unknown.
         scaled, refined: the camera's path before and after the refinement; ``final`` is the refined path, else the
             scaled one.
@@ -65,8 +65,8 @@ class Content:
         *,
         images_path: Path | None = None,
         home: Path | None = None,
-        title: str | None = None,
-        by: str | None = None,
+        title: str = "",
+        by: str = "",
     ):
         """Read what the report needs.
 
@@ -74,7 +74,7 @@ class Content:
             result: the folder to read.
             images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result.
             home: folder that names the result, where the result is still in a temporary folder; None: its own folder.
-            title, by: None: those that the run was given.
+            title, by: empty: those that the run was given.
 
         Raises:
             InputError: a file of the result is there but cannot be read.
@@ -83,53 +83,46 @@ class Content:
         given = self.summary.settings.report
         folder = real_path(home or result.path)
         own_name = folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
-        self.title, self.by = title or given.title or own_name, by or given.by
+        self.title, self.by = title or given.title or own_name, by or given.by or ""
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
-        self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)
-        self.range_times_s = np.zeros(0)
-        if self.ranges is not None:
-            of_photos = result.timestamps_s or {}
-            times = np.array([of_photos.get(name, np.nan) for name in self.ranges.image_name], dtype=np.float64)
-            times = np.where(np.isfinite(self.ranges.timestamp_s), self.ranges.timestamp_s, times)
-            self.range_times_s = times - np.min(times, initial=np.inf, where=np.isfinite(times))
-        scaled, refined = models = [result.read_model(stage) for stage in ("sparse_scaled", "sparse_metric")]
-        self.scaled, self.refined = (None if model is None else path_in_result(model, result) for model in models)
-        self.final = self.refined or self.scaled
-        final = refined or scaled or pycolmap.Reconstruction()
+        self.tags_in_cam_m = result.lever_arms_m(self.ranges.tag_id)
+        of_photos = result.timestamps_s or {}
+        times = np.array([of_photos.get(name, np.nan) for name in self.ranges.image_name], dtype=np.float64)
+        times = np.where(np.isfinite(self.ranges.timestamp_s), self.ranges.timestamp_s, times)
+        self.range_times_s = times - np.min(times, initial=np.inf, where=np.isfinite(times))
+        scaled, refined = models = [result.read_model(stage) or pycolmap.Reconstruction() for stage in MODEL_NAMES]
+        self.scaled, self.refined = (path_in_result(model, result) for model in models)
+        self.final, final = (self.refined, refined) if self.refined else (self.scaled, scaled)
         self.points_m, self.points_rgb = colored_points(final)
         self.point_ids = np.array(sorted(final.point3D_ids()), dtype=np.int64)
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
-        self.reference_m = None if reference is None else reference.positions_m
-        names = () if reference is None else reference.image_names or ()
-        self.reference_by_photo = {} if reference is None else dict(zip(names, reference.positions_m))
+        self.reference_m = reference.positions_m if reference else np.zeros((0, 3))
+        self.reference_by_photo = dict(zip(reference.image_names or (), self.reference_m)) if reference else {}
 
     @cached_property
-    def true_scale(self) -> Trajectory | None:
-        """Return the path before the refinement, resized to the scale of the reference; None if that is not known.
+    def true_scale(self) -> Trajectory:
+        """Return the path before the refinement, resized to the scale of the reference; empty if that is not known.
 
         The size follows from the scale error that the comparison found, because the reference may hold the positions of
         only a few photos.
         """
         errors = [row.scale_error_percent for row in self.summary.comparison if row.name == "scaled"]
-        if self.scaled is None or not errors or errors[0] is None:
-            return None
+        if not self.scaled or not errors or errors[0] is None:
+            return trajectory_from_reconstruction(pycolmap.Reconstruction())
         return self.scaled.resized(1.0 / (1.0 + errors[0] / 100.0), self.summary.frame)
 
     @cached_property
-    def true_ranges_m(self) -> Array | None:
-        """Return the true length of each range by the reference, (n,) metres; NaN where unknown, None if all are.
+    def true_ranges_m(self) -> Array:
+        """Return the true length of each range by the reference, (n,) metres; NaN where unknown.
 
         They are known for ranges that are used and were taken at a photo, because the reference may not say where the
         camera was in between. Camera orientations and anchor positions are those of the final map.
         """
-        ranges, path = self.ranges, self.final
-        if ranges is None or path is None or not self.reference_by_photo:
-            return None
-        anchors_m = self.result.anchor_positions_m
+        ranges, path, anchors_m = self.ranges, self.final, self.result.anchor_positions_m
         index_of = {name: i for i, name in enumerate(path.image_names)}
-        distances = np.full(len(ranges.status), np.nan)
+        distances = np.full(len(ranges), np.nan)
         for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
             fraction = float(ranges.weight[row])
             name = (ranges.keyframe_before if fraction < 0.5 else ranges.keyframe_after)[row]
@@ -138,13 +131,11 @@ class Content:
             if is_at_photo and position is not None and anchor is not None:
                 tag = position + path.world_from_cam[index_of[name]] @ self.tags_in_cam_m[row]
                 distances[row] = np.linalg.norm(tag - anchor)
-        return distances if np.isfinite(distances).any() else None
+        return distances
 
 
-def _cameras(
-    scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None
-) -> Iterator[CameraIntrinsics]:
-    before, after = ({} if model is None else dict(model.cameras) for model in (scaled, refined))
+def _cameras(scaled: pycolmap.Reconstruction, refined: pycolmap.Reconstruction) -> Iterator[CameraIntrinsics]:
+    before, after = (dict(model.cameras) for model in (scaled, refined))
     for camera_id, camera in sorted((after or before).items()):
         names = [name.strip() for name in camera.params_info.split(",")]
         unknown = [math.nan] * len(names)

@@ -16,7 +16,7 @@ def facts_of(content: Content) -> list[tuple[str, str]]:
     found = (
         ("What was done", _what(content)),
         ("When", _when(content)),
-        ("By", content.by or ""),
+        ("By", content.by),
         ("Coordinates", _coordinates(content)),
         ("Computed", _computed(content)),
     )
@@ -27,8 +27,8 @@ def _what(content: Content) -> str:
     """Return a sentence about the photos, another about the ranges and lengths, and one about the adjustment."""
     summary, path = content.summary, content.final
     ranges, num_points = summary.ranges, count(summary.map.num_points3D)
-    length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
-    way = "" if length_m is None else f" along {fixed(length_m, 1, 'm')}"
+    length_m = float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
+    way = f" along {fixed(length_m, 1, 'm')}" if path else ""
     said = [f"{count(summary.map.num_photos)} photos{way} show {num_points} points."]
     if summary.has_ranges:
         said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {_anchors(content)} give it metres.")
@@ -85,7 +85,7 @@ def frame_in_words(content: Content) -> str:
     """Return which frame the coordinates of a map have, and the directions of its axes."""
     if content.summary.frame == "site":
         return "the site's frame, with z up"
-    first = "the first photo" if content.final is None else f"the first photo, {content.final.image_names[0]}"
+    first = f"the first photo, {content.final.image_names[0]}" if content.final else "the first photo"
     return f"the frame of {first} (x right, y down, z forward)"
 
 

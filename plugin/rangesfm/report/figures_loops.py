@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rangesfm.arrays import Array
@@ -12,11 +14,11 @@ from rangesfm.result.result_tables import LoopPairs
 _SIZE = (420.0, 420.0)
 
 
-def loops_figure(content: Content) -> Figure | None:
-    """Return the graph of matches: a dot for each pair of keyframes that closed a loop, or contradicted the ranges."""
+def loops_figure(content: Content) -> Iterator[Figure]:
+    """Yield the graph of matches: a dot for each pair of keyframes that closed a loop, or contradicted the ranges."""
     pairs, path = content.result.read(LoopPairs), content.final
-    if pairs is None or not pairs.status or path is None:
-        return None
+    if not pairs or not path:
+        return
     number = {name: k for k, name in enumerate(path.image_names, 1)}
 
     def dots(status: str) -> Array:
@@ -39,4 +41,4 @@ def loops_figure(content: Content) -> Figure | None:
         keeps_shape=True,
     )
     caption = "Pairs of keyframes that match: neighbours in time are on the line, loops are away from it."
-    return Figure("loops", caption, (panel,))
+    yield Figure("loops", caption, (panel,))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,16 +21,15 @@ _ROW_HEIGHT_PX = 22.0
 _COLORS = {"found": "before", "not found": "after", "would not be found, however large": "rejected"}
 
 
-def mistakes_figure(content: Content) -> Figure | None:
-    """Return the figure of the mistakes: evidence on the left, largest hidden effect on the scale on the right.
+def mistakes_figure(content: Content) -> Iterator[Figure]:
+    """Yield the figure of the mistakes: evidence on the left, largest hidden effect on the scale on the right.
 
-    The mistakes found come first, then those that may change the scale most, up to ``MAX_NUM_ROWS``. None where no test
-    has anything to show.
+    The mistakes found come first, then those that may change the scale most, up to ``MAX_NUM_ROWS``.
     """
     tests = sorted(content.summary.tests, key=lambda test: (not test.rejected, -_effect_percent(test)))
     shown = [test for test in tests if test.rejected or _effect_percent(test) > 0][:MAX_NUM_ROWS]
     if not shown:
-        return None
+        return
     evidence = _panel(
         "Evidence",
         "Evidence of the ranges for each mistake, and the limit of chance",
@@ -57,7 +56,7 @@ def mistakes_figure(content: Content) -> Figure | None:
         "beyond the line it is more than chance explains. Right: how much a mistake may change the scale that is just "
         "too small to be found, with that size. Values beyond an axis are drawn at its edge; the table has them."
     )
-    return Figure("mistake_tests", caption, (evidence, could_hide), layout="views")
+    yield Figure("mistake_tests", caption, (evidence, could_hide), layout="views")
 
 
 def _panel(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rangesfm.arrays import Array
@@ -29,36 +31,36 @@ _MIN_WINDOW = 3
 _NUM_WINDOWS = 20
 
 
-def trajectory_views(content: Content) -> Figure | None:
-    """Return plan and elevation of the path: with the true scale, scaled, and refined."""
+def trajectory_views(content: Content) -> Iterator[Figure]:
+    """Yield plan and elevation of the path: with the true scale, scaled, and refined."""
     if not content.final:
-        return None
+        return
     frame = content.summary.frame
     views = tuple(_trajectory_view(content, view) for view in views_of(content.final.centers, frame))
     caption = (
         f"The camera's path in metres, in {frame_in_words(content)}. Scaled: the unscaled map with the scale found. "
     )
     caption += "Refined: after photos and measurements were adjusted together."
-    if content.true_scale is not None:
+    if content.true_scale:
         caption += " True scale: the unscaled map with the scale of the reference, so that only its drift is left."
-    return Figure("trajectory", caption, views, layout="views")
+    yield Figure("trajectory", caption, views, layout="views")
 
 
-def map_views(content: Content) -> Figure | None:
-    """Return plan and elevation of the map's points in their own colours."""
+def map_views(content: Content) -> Iterator[Figure]:
+    """Yield plan and elevation of the map's points in their own colours."""
     if not content.final or len(content.points_m) == 0:
-        return None
+        return
     path = content.final.centers
     views = tuple(_map_view(content, path, view) for view in views_of(path, content.summary.frame))
     caption = "The map's points in the photos' colours, seen from above and from the side."
-    return Figure("map_points", caption, views, layout="views", table="points")
+    yield Figure("map_points", caption, views, layout="views", table="points")
 
 
-def local_scale(content: Content) -> Figure | None:
-    """Return the figure of the local scale of the scaled map along the path, which shows its drift in scale."""
+def local_scale(content: Content) -> Iterator[Figure]:
+    """Yield the figure of the local scale of the scaled map along the path, which shows its drift in scale."""
     path = content.scaled
-    if path is None or content.refined is None:
-        return None
+    if not path or not content.refined:
+        return
     known = [content.reference_by_photo.get(name, [np.nan] * 3) for name in path.image_names]
     series = [
         Series("refined, relative to scaled", "after", _local_scales(path, content.refined.centers), "line"),
@@ -71,8 +73,8 @@ def local_scale(content: Content) -> Figure | None:
     ]
     series = [one for one in series if len(one.points)]
     if not series:
-        return None
-    return figure_of(
+        return
+    yield figure_of(
         "local_scale",
         f"Scale of parts of the path of {2 * _window(path) + 1} photos, relative to that of the scaled map. A level "
         "line away from zero is an error of the whole scale; a slope is drift.",
@@ -87,8 +89,8 @@ def local_scale(content: Content) -> Figure | None:
 def _trajectory_view(content: Content, view: View) -> Panel:
     paths = [("true scale", "true-scale", content.true_scale), ("scaled", "before", content.scaled)]
     paths.append(("refined", "after", content.refined))
-    lines = [Series(name, color, view.seen(path.centers), "line") for name, color, path in paths if path is not None]
-    if content.reference_m is not None:
+    lines = [Series(name, color, view.seen(path.centers), "line") for name, color, path in paths if path]
+    if len(content.reference_m):
         lines.append(Series("reference", "reference", view.seen(content.reference_m), "dashed"))
     places, marks = view.anchors(content.result.anchor_positions_m)
     limits = equal_view(np.concatenate([*(line.points for line in lines), places]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -38,14 +39,14 @@ _SIZE_ALONE = (660.0, 330.0)
 _COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 
 
-def residuals_over_time(content: Content) -> Figure | None:
-    """Return the figure of range residuals over time, with a panel for each anchor.
+def residuals_over_time(content: Content) -> Iterator[Figure]:
+    """Yield the figure of range residuals over time, with a panel for each anchor.
 
     The dots are of the final map alone: those of two maps, one over the other, would have the colour of neither.
     """
     ranges = content.ranges
-    if ranges is None or not _of_used(ranges):
-        return None
+    if not _of_used(ranges):
+        return
     panels = tuple(
         _residual_panel(content, ranges, anchor_id) for anchor_id in sorted({*ranges.anchor_id}, key=natural_order)
     )
@@ -54,20 +55,20 @@ def residuals_over_time(content: Content) -> Figure | None:
         "ranges used. A steady offset is a bias; a slow wave is drift of the map or an error of the time offset. "
         "Values beyond an axis are drawn at its edge." + _thinned(len(ranges.status))
     )
-    return Figure("range_residuals", caption, panels, layout="panels", table="ranges")
+    yield Figure("range_residuals", caption, panels, layout="panels", table="ranges")
 
 
-def residual_histogram(content: Content) -> Figure | None:
-    """Return the histogram of the residuals of the ranges used, before and after the refinement."""
+def residual_histogram(content: Content) -> Iterator[Figure]:
+    """Yield the histogram of the residuals of the ranges used, before and after the refinement."""
     ranges = content.ranges
-    if ranges is None or not _of_used(ranges):
-        return None
+    if not _of_used(ranges):
+        return
     limit = _residual_limit(ranges)
     edges = np.linspace(-limit, limit, NUM_HISTOGRAM_BINS + 1)
     outlines = [
         Series(name, _COLORS[name], histogram(known, edges), "filled") for name, known in _of_used(ranges).items()
     ]
-    return figure_of(
+    yield figure_of(
         "range_residual_histogram",
         "Residuals of the ranges used. Real radios measure too long more often than too short; such residuals are "
         "negative.",
@@ -80,15 +81,15 @@ def residual_histogram(content: Content) -> Figure | None:
     )
 
 
-def absolute_errors(content: Content) -> Figure | None:
-    """Return the figure of the true errors of ranges: as measured, and as predicted by both maps.
+def absolute_errors(content: Content) -> Iterator[Figure]:
+    """Yield the figure of the true errors of ranges: as measured, and as predicted by both maps.
 
-    The true ranges follow from the camera positions of the reference; None without one.
+    The true ranges follow from the camera positions of the reference.
     """
     ranges, true_m = content.ranges, content.true_ranges_m
-    if ranges is None or true_m is None:
-        return None
     rows = np.flatnonzero(np.isfinite(true_m))
+    if not len(rows):
+        return
     times, time_label = time_axis(content.range_times_s)
     lengths = {"measured": ranges.range_m}
     lengths |= {name: residuals + ranges.range_m for name, residuals in ranges.residuals_by_model_m.items()}
@@ -99,7 +100,7 @@ def absolute_errors(content: Content) -> Figure | None:
         Series(name, _COLORS[name], errors[:: every_nth(len(rows), MAX_NUM_DRAWN)]) for name, errors in points.items()
     ]
     sizes = np.concatenate([series.points[:, 1] for series in dots])
-    return figure_of(
+    yield figure_of(
         "absolute_range_errors",
         "Absolute errors of ranges against the reference: as measured, as predicted by the scaled map and by the "
         "refined map, with their running medians. Shown are ranges that were taken at a photo; anchor positions are "

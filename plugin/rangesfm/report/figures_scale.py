@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rangesfm.report.content import Content
@@ -15,13 +17,13 @@ CANDIDATE_AXIS = (-1.0, 4.0)
 """Ends of the axis of candidates, in units of the scale. Candidates themselves are unbounded."""
 
 
-def scale_per_anchor_figure(content: Content) -> Figure | None:
-    """Return the figure of the scale from each anchor alone, beside that of all anchors and its 95 % interval."""
+def scale_per_anchor_figure(content: Content) -> Iterator[Figure]:
+    """Yield the figure of the scale from each anchor alone, beside that of all anchors and its 95 % interval."""
     scale, joint = content.summary.scale, content.summary.metric_from_sfm.scale
     values = {anchor_id: scale.per_anchor[anchor_id] for anchor_id in sorted({*scale.per_anchor}, key=natural_order)}
     alone = {anchor_id: value for anchor_id, value in values.items() if value is not None}
     if len(alone) < 2:
-        return None
+        return
     half = 1.25 * max([abs(end - joint) for end in (*alone.values(), *(scale.interval_95 or ()), 1.0001 * joint)])
     marks, rows = [], []
     for row, (anchor_id, value) in enumerate(alone.items()):
@@ -29,7 +31,7 @@ def scale_per_anchor_figure(content: Content) -> Figure | None:
         rows.append((float(row), anchor_id, percent))
         title = f"anchor {anchor_id}: {value:.6g} m per unit, {percent}"
         marks.append(Mark("one anchor", "after", "disc", value, row, "", title))
-    return figure_of(
+    yield figure_of(
         "scale_per_anchor",
         "The scale from each anchor alone, and its difference from the scale from all of them before the refinement "
         "(the line). Band: the 95 % interval of the scale. An error of a single anchor, such as a wrong position, "
@@ -47,12 +49,12 @@ def scale_per_anchor_figure(content: Content) -> Figure | None:
     )
 
 
-def candidates(content: Content) -> Figure | None:
-    """Return the figure of the 2018 paper: both candidates of each range over time."""
+def candidates(content: Content) -> Iterator[Figure]:
+    """Yield the figure of the 2018 paper: both candidates of each range over time."""
     table, scale = content.result.read(ScaleCandidates), content.summary.metric_from_sfm.scale
-    if table is None or len(table.alpha0) == 0:
-        return None
-    stride = every_nth(len(table.alpha0), MAX_NUM_CANDIDATES)
+    if not table:
+        return
+    stride = every_nth(len(table), MAX_NUM_CANDIDATES)
     times, label = time_axis(table.timestamp_s[::stride])
     found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (
@@ -62,7 +64,7 @@ def candidates(content: Content) -> Figure | None:
     )
     if stride > 1:
         caption += f" One range in {stride} is drawn; scale_candidates.csv has all."
-    return figure_of(
+    yield figure_of(
         "scale_candidates",
         caption,
         "Both candidates of the scale over time",
@@ -77,13 +79,13 @@ def candidates(content: Content) -> Figure | None:
     )
 
 
-def consensus(content: Content) -> Figure | None:
-    """Return the figure of how many ranges agree with each scale."""
+def consensus(content: Content) -> Iterator[Figure]:
+    """Yield the figure of how many ranges agree with each scale."""
     table = content.result.read(ScaleConsensus)
-    if table is None or len(table.scale) == 0:
-        return None
+    if not table:
+        return
     curve = Series("ranges that agree", "after", np.column_stack([table.scale, table.num_agreeing]), "filled")
-    return figure_of(
+    yield figure_of(
         "scale_consensus",
         "Number of ranges that agree with each scale within their tolerance; anchor positions are those estimated. A "
         "sound survey has one high, narrow peak at the scale found (the line).",
@@ -95,13 +97,13 @@ def consensus(content: Content) -> Figure | None:
     )
 
 
-def clock_curve(content: Content) -> Figure | None:
-    """Return the figure of how badly the ranges fit for each time offset between the clocks."""
+def clock_curve(content: Content) -> Iterator[Figure]:
+    """Yield the figure of how badly the ranges fit for each time offset between the clocks."""
     table = content.result.read(TimeOffsetCurve)
-    if table is None or len(table.cost) == 0:
-        return None
+    if not table:
+        return
     offset = content.summary.time_offset.value_s
-    return figure_of(
+    yield figure_of(
         "time_offset_curve",
         "Misfit of the ranges for each time offset between the clocks. A sound survey has one sharp minimum, at the "
         "line.",

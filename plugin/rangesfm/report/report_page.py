@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -45,40 +45,43 @@ class Section(NamedTuple):
     is_appendix: bool = False
 
 
-_Maker = Callable[[Content], Figure | report_tables.ReportTable | None]
 # Sections of the report: id and title, and the functions that make its figures and tables.
+_Parts = tuple[
+    Sequence[Callable[[Content], Iterable[Figure]]], Sequence[Callable[[Content], report_tables.ReportTable]]
+]
 _FOUND = ("found", "Mistakes that the ranges show")
-_SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
-    _FOUND: (partial(report_tables.mistakes, are_found=True),),
+_SECTIONS: dict[tuple[str, str], _Parts] = {
+    _FOUND: ((), (partial(report_tables.mistakes, are_found=True),)),
     ("path", "Path"): (
-        *(figures_path.trajectory_views, figures_path.map_views, loops_figure, figures_path.local_scale),
-        report_tables.comparison,
+        (figures_path.trajectory_views, figures_path.map_views, loops_figure, figures_path.local_scale),
+        (report_tables.comparison,),
     ),
     ("scale", "Scale and clocks"): (
-        *(figures_scale.scale_per_anchor_figure, figures_scale.consensus, figures_scale.clock_curve),
-        *(report_tables.scale_by_kind, report_tables.error_budget, report_tables.sensitivity),
+        (figures_scale.scale_per_anchor_figure, figures_scale.consensus, figures_scale.clock_curve),
+        (report_tables.scale_by_kind, report_tables.error_budget, report_tables.sensitivity),
     ),
     ("ranges", "Ranges"): (
-        *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
-        *(report_tables.range_statuses, report_tables.ranges_per_anchor),
+        (figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
+        (report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
-    ("anchors", "Anchors and measured lengths"): (report_tables.anchors, report_tables.distances),
-    ("points", "Known points and positions"): (report_tables.control_points, report_tables.positions_used),
+    ("anchors", "Anchors and measured lengths"): ((), (report_tables.anchors, report_tables.distances)),
+    ("points", "Known points and positions"): ((), (report_tables.control_points, report_tables.positions_used)),
 }
-_APPENDIX: dict[tuple[str, str], tuple[_Maker, ...]] = {
+_APPENDIX: dict[tuple[str, str], _Parts] = {
     ("mistakes", "Mistakes that were tested for and not found"): (
-        *(
-            figures_mistakes.mistakes_figure,
-            partial(report_tables.mistakes, are_found=False),
-            report_tables.reliability,
-        ),
+        (figures_mistakes.mistakes_figure,),
+        (partial(report_tables.mistakes, are_found=False), report_tables.reliability),
     ),
     ("candidates", "The method of the 2018 paper, for comparison"): (
-        *(figures_scale.candidates, report_tables.two_candidates),
+        (figures_scale.candidates,),
+        (report_tables.two_candidates,),
     ),
     ("run", "How it was computed"): (
-        *(report_tables.stages, report_tables.refinement, report_tables.versions, report_tables.notes),
-        *(report_tables.intrinsics, report_tables.inputs, report_tables.settings),
+        (),
+        (
+            *(report_tables.stages, report_tables.refinement, report_tables.versions, report_tables.notes),
+            *(report_tables.intrinsics, report_tables.inputs, report_tables.settings),
+        ),
     ),
 }
 STYLES = ("page.css", "view.css")
@@ -92,10 +95,9 @@ _FILTERS = (text.count, text.duration, text.fixed, text.percent, text.sentence, 
 def sections_of(content: Content) -> list[Section]:
     """Return all sections of the report, with their figures and tables."""
     sections = []
-    for (id_, title), makers in (_SECTIONS | _APPENDIX).items():
-        made = [make(content) for make in makers]
-        figures = [each for each in made if isinstance(each, Figure)]
-        tables = [each for each in made if isinstance(each, report_tables.ReportTable)]
+    for (id_, title), (drawn, listed) in (_SECTIONS | _APPENDIX).items():
+        figures = [figure for make in drawn for figure in make(content)]
+        tables = [make(content) for make in listed]
         is_open, is_appendix = (id_, title) == _FOUND, (id_, title) in _APPENDIX
         sections.append(Section(id_, title, figures, tables, is_open, is_appendix))
     return sections

@@ -80,32 +80,31 @@ class ReportTable:
     Attributes:
         header: names of the columns; empty for a table without a header.
         rows: cells of each row, the first of which names the row. Text that is not Markup is escaped.
-        kind: class of the table's own CSS style; None: that of all tables.
+        kind: class of the table's own CSS style; empty: that of all tables.
         is_narrow: whether it can stand beside other narrow tables.
     """
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    note: str | None = None
-    kind: str | None = None
+    note: str = ""
+    kind: str = ""
     is_narrow: bool = False
 
 
 def range_statuses(content: Content) -> ReportTable:
     """Return the table of how many ranges of the log have each status."""
-    statuses = Counter([] if content.ranges is None else content.ranges.status)
+    statuses = Counter(content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
     meanings = [f"{name}: {_STATUSES[name]}" for name in statuses if name in _STATUSES]
-    note = sentence("; ".join(meanings)) if meanings else None
+    note = sentence("; ".join(meanings)) if meanings else ""
     return ReportTable("What became of the ranges", ["status", "ranges", "of all"], rows, note)
 
 
 def ranges_per_anchor(content: Content) -> ReportTable:
     """Return the table of each anchor's ranges: how many, and their residuals before and after the refinement."""
     ranges, rows = content.ranges, []
-    for anchor_id in [] if ranges is None else sorted({*ranges.anchor_id}, key=natural_order):
-        assert ranges is not None
+    for anchor_id in sorted({*ranges.anchor_id}, key=natural_order):
         mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
         used = mine & ranges.is_used
         row = [anchor_id, count(int(mine.sum())), count(int(used.sum()))]
@@ -309,7 +308,7 @@ def control_points(content: Content) -> ReportTable:
 def intrinsics(content: Content) -> ReportTable:
     """Return the table of the cameras' intrinsics before the refinement and, if there was one, after it."""
     header = ["camera", "parameter", "scaled", "refined", "change"]
-    num_columns = 3 if content.refined is None else 5
+    num_columns = 5 if content.refined else 3
     rows = [
         [camera.title, name, fixed(before, 6), fixed(after, 6), signed(after - before, 6)][:num_columns]
         for camera in content.cameras

@@ -102,14 +102,13 @@ def scene_of(content: Content) -> Scene | None:
     if not content.final:
         return None
     paths = []
-    if content.reference_m is not None:
-        n = len(content.reference_m)
+    if n := len(content.reference_m):
         nowhere = np.tile(np.eye(3), (n, 1, 1))
         reference = Trajectory(np.arange(n), tuple(map(str, range(n))), None, content.reference_m, nowhere)
         paths.append(ScenePath("reference", "Reference", "reference", reference, False))
     if content.scaled:
         # Often it is hardly apart from the refined path, and the colours of both would be mixed.
-        is_result = content.refined is None
+        is_result = not content.refined
         paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled, is_shown=is_result))
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
@@ -159,7 +158,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
         anchor_ids = [anchor["id"] for anchor in anchors]
         errors = errors_of_scene(content.result.read_map_errors(), content.summary, scene.result, anchor_ids)
     num_left_out = len(scene.points_m) - (points["num"] if points else 0)
-    stride = 1 if content is None or content.ranges is None else every_nth(len(content.ranges.status), MAX_NUM_RANGES)
+    stride = 1 if content is None else every_nth(len(content.ranges), MAX_NUM_RANGES)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
         f"{count(num_left_out)} points are not drawn, because they are far away or too many." if num_left_out else "",
@@ -262,7 +261,7 @@ def _anchor(anchor_id: str, anchor: AnchorEntry, origin_m: Array) -> dict[str, A
 
 def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
     ranges = content.ranges
-    if ranges is None or len(ranges.status) == 0:
+    if not ranges:
         return None
     rows = np.arange(0, len(ranges.status), every_nth(len(ranges.status), MAX_NUM_RANGES))
     before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
@@ -291,7 +290,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         "residual_refined": pack(residuals_m.get("refined", unknown)[rows], "float32"),
         "final": f"residual_{final}",
         "residual_limit_m": _residual_limit(residuals_m[final][ranges.is_used]),
-        "true": None if content.true_ranges_m is None else pack(content.true_ranges_m[rows], "float32"),
+        "true": pack(content.true_ranges_m[rows], "float32") if np.isfinite(content.true_ranges_m).any() else None,
         "has_place": pack(has_place, "uint8"),
         "before": pack(np.maximum(before, 0), "int32"),
         "after": pack(np.maximum(after, 0), "int32"),

@@ -116,8 +116,8 @@ class ResultFolder:
         arms = [settings.lever_arms_m.get(tag_id, settings.tag_in_cam_m) for tag_id in tag_ids]
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
 
-    def read(self, table: type[_Table]) -> _Table | None:
-        """Read one of ``RESULT_TABLES``; None if its file is not there."""
+    def read(self, table: type[_Table]) -> _Table:
+        """Read one of ``RESULT_TABLES``; without its file it has no rows."""
         return table.read(self.path)
 
     def read_map_errors(self) -> MapErrors | None:
@@ -161,4 +161,5 @@ def read_result_folder(path: Path) -> ResultFolder:
     if not result_path.is_file():
         raise InputError("not a result folder: it has no result.json (expected the output_path of a run)", path)
     summary, times = ResultSummary.read(result_path), PhotoTimes.read(path)
-    return ResultFolder(path, summary, None if times is None else times.by_name)
+    by_name = dict(zip(times.image_name, times.timestamp_s.tolist(), strict=True))
+    return ResultFolder(path, summary, by_name if (path / PhotoTimes.NAME).is_file() else None)

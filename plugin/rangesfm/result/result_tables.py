@@ -48,6 +48,9 @@ class TableFile:
 
     NAME: ClassVar[str]
 
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
     @classmethod
     def columns(cls) -> dict[str, ColumnFormat]:
         """Return the columns by name, in their order."""
@@ -65,15 +68,15 @@ class TableFile:
         write_table(folder / self.NAME, list(columns), zip(*cells, strict=True))
 
     @classmethod
-    def read(cls: type[_Kind], folder: Path) -> _Kind | None:
-        """Read the file of a folder; None if it is not there.
+    def read(cls: type[_Kind], folder: Path) -> _Kind:
+        """Read the file of a folder; if it is not there, the table has no rows.
 
         Raises:
             InputError: the file was not written by a run; the text names the line.
         """
         path, columns = folder / cls.NAME, cls.columns()
         if not path.is_file():
-            return None
+            return cls(**{name: () if spec == _TEXT else np.zeros(0) for name, (spec, _) in columns.items()})
         table, values = read_table(path, list(columns)), dict[str, Any]()
         for name, (spec, may_be_empty) in columns.items():
             if spec == _TEXT:
@@ -158,10 +161,6 @@ class PhotoTimes(TableFile):
     NAME: ClassVar[str] = "images.csv"
     image_name: Texts
     timestamp_s: Numbers
-
-    @cached_property
-    def by_name(self) -> dict[str, float]:
-        return dict(zip(self.image_name, self.timestamp_s.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
