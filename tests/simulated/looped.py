@@ -248,7 +248,7 @@ class SimulatedMap:
         covariance = joint_errors(self.at_rest, 1.0)
         assert covariance is not None
         pixel_stddev = self.at_rest.pixel_stddev
-        return LoopFinder.in_refined_map(self.model, self.scaled.trajectory, covariance.errors, pixel_stddev, seed=0)
+        return LoopFinder.in_refined_map(self.model, self.scaled.trajectory, covariance, pixel_stddev, seed=0)
 
     def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
         return find_in(self.finder, self.matches_of, self.looped.known, tried)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,7 +28,7 @@ from rangesfm.solver import (
     range_cost,
     tangent_jacobian,
 )
-from rangesfm.solver.covariance import JointCovariance, PhotosAlone, ResidualErrors, joint_covariance
+from rangesfm.solver.covariance import JointCovariance, PhotosAlone, joint_covariance
 from rangesfm.solver.normal_equations import BlockColumns, NormalEquations
 from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.util.geometry.trajectory import pose_of
@@ -181,30 +181,6 @@ def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
         start += 3 * len(ANCHORS_M)
     biases = [expected[start + k, start + k] for k in range(len(ANCHORS_M))]
     assert np.ravel(found.others) == pytest.approx(biases, rel=1e-5)
-
-
-def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
-    survey = joint(model(), hold_first=True)
-    num_ranges = NUM_FRAMES * len(ANCHORS_M)
-    num = survey.problem.num_residuals()
-    rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
-    rng = np.random.default_rng(0)
-    # Each range has an error of its own with a variance of 1.7, and there are three errors that all share.
-    by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
-    of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
-    errors = ResidualErrors(rows, csr_array(by_error), of_errors, np.arange(num - 1, num))
-    found = survey.covariance(errors=errors)
-    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
-    of_residuals = np.eye(num)
-    of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
-    of_residuals[-1, -1] = 0.0  # a prior without error
-    gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
-    expected = gain @ of_residuals @ gain.T
-    first = 6 * (NUM_FRAMES - 1)
-    np.testing.assert_allclose(found.anchors[0], expected[first : first + 3, first : first + 3], rtol=1e-5)
-    np.testing.assert_allclose(np.diag(found.rig_from_world[1])[3:], np.diag(expected)[3:6], rtol=1e-5)
-    alone = survey.covariance()
-    assert found.relative_scale_stddev > 1.1 * alone.relative_scale_stddev
 
 
 def test_centers_err_as_their_poses_do() -> None:
@@ -398,13 +374,19 @@ def ratios(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
     return np.array(found), slopes
 
 
+def of_functions(photos: PhotosAlone, frame_ids: Any, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
+    """Return the covariance of functions of poses, and their change where the map moves to the photos' minimum."""
+    gradients = photos.by_steps(frame_ids, by_turn, by_center)
+    return gradients.T @ photos.solve(gradients), gradients.T @ photos.at_minimum
+
+
 @pytest.mark.parametrize("hold_first", [False, True])
 def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hold_first: bool) -> None:
     reconstruction, adjuster = photos_alone(hold_first=hold_first)
     frames = np.array(sorted(reconstruction.reg_frame_ids()))
     _, slopes = ratios(reconstruction)
     equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
-    found, shift = PhotosAlone(equations, 0.7).of_functions(frames, np.zeros_like(slopes), slopes)
+    found, shift = of_functions(PhotosAlone(equations, 0.7), frames, np.zeros_like(slopes), slopes)
     poses = [pose_of(reconstruction.frame(i)).params for i in frames.tolist()]
     blocks = [*poses, *(point.xyz for point in reconstruction.points3D.values())]
     is_free = [adjuster.problem.has_parameter_block(block) for block in blocks]
@@ -430,7 +412,7 @@ def test_what_photos_leave_open_does_not_depend_on_the_world_of_the_map() -> Non
     for seed in range(4):
         _, slopes = ratios(reconstruction)
         equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
-        found.append(PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)[0])
+        found.append(of_functions(PhotosAlone(equations, 1.0), frames, np.zeros_like(slopes), slopes)[0])
         rotation = pycolmap.Rotation3d(Rotation.random(rng=seed).as_quat())
         reconstruction.transform(pycolmap.Sim3d(1.5, rotation, np.array([20.0, -5.0, 3.0])))
     np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=1e-10)
@@ -444,49 +426,8 @@ def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
         pose_of(reconstruction.frame(frame)).params[4:] += 1e-3 * rng.standard_normal(3)
     after, slopes = ratios(reconstruction)
     equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
-    _, shift = PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)
+    _, shift = of_functions(PhotosAlone(equations, 1.0), frames, np.zeros_like(slopes), slopes)
     np.testing.assert_allclose(shift, before - after, rtol=0.05)
-
-
-def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
-    """Priors that err less than their stddevs say make the centres more certain."""
-    survey = joint(model())
-    rows = np.zeros(0, dtype=np.int64)
-    nothing = csr_array((0, 1))
-    usual, better = (
-        survey.covariance(errors=ResidualErrors(rows, nothing, np.eye(1), rows, variance),
-        )
-        for variance in (1.0, 0.0)
-    )  # fmt: skip
-    plain = survey.covariance()
-    np.testing.assert_allclose(usual.centers, plain.centers, rtol=1e-9)
-    assert (np.trace(better.centers, axis1=1, axis2=2) < np.trace(usual.centers, axis1=1, axis2=2)).all()
-
-
-def test_an_anchor_whose_ranges_weigh_far_more_than_they_err_keeps_a_positive_variance() -> None:
-    """Its variance towards the frames is a millionth of the ranges' own, less than a difference of two can resolve."""
-    survey = joint(model(), hold_first=True, num_anchors=0)
-    anchor, bias, frames = np.array([500.0, 3.0, 1.0]), np.zeros(1), np.arange(NUM_FRAMES)
-    ranges = PlacedRanges(
-        range_m=np.linalg.norm(orbit_path(1.4 * NUM_FRAMES).centers(np.arange(8.0)) - anchor, axis=1),
-        stddev_m=np.full(NUM_FRAMES, 1e-5),
-        before=frames,
-        after=frames,
-        weight=np.zeros(NUM_FRAMES),
-        offset_in_world_m=np.zeros((NUM_FRAMES, 3)),
-        anchor_index=np.zeros(NUM_FRAMES, dtype=np.int64),
-        tag_index=np.zeros(NUM_FRAMES, dtype=np.int64),
-    )
-    rows = add_ranges(survey.adjuster, ranges, RangeBlocks(survey.poses, [anchor], [bias], [TAG_IN_CAM_M]))
-    survey.problem.set_parameter_block_constant(bias)
-    errors = ResidualErrors(rows, csr_array(np.ones((NUM_FRAMES, 1))), np.full((1, 1), 1e-8), np.zeros(0, dtype=int))
-    (found,) = survey.covariance(anchors=[anchor], others=[bias], errors=errors).anchors
-    blocks = variable(replace(survey, anchors=[anchor], biases=[bias]))
-    gain = np.linalg.pinv(tangent_jacobian(survey.problem, blocks).toarray())
-    of_residuals = np.eye(survey.problem.num_residuals())
-    of_residuals[np.ix_(rows, rows)] = 1e-8
-    expected = (gain @ of_residuals @ gain.T)[42:45, 42:45]
-    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(expected), rtol=0.05)
 
 
 def random_pose(seed: int) -> Array:
@@ -614,7 +555,7 @@ def test_functions_of_poses_err_as_the_photos_inverse_says() -> None:
     given, rng = small(), np.random.default_rng(3)
     of_photos = csr_array(given.equations.of_photos).toarray()[:12, :12]
     by_turn, by_center = rng.normal(size=(2, 2, 3, 3))
-    found, shift = PhotosAlone(given.equations, 0.5).of_functions(np.array([3, 1, 2]), by_turn, by_center)
+    found, shift = of_functions(PhotosAlone(given.equations, 0.5), np.array([3, 1, 2]), by_turn, by_center)
     slopes = np.zeros((2, 12))
     for k, (pose, columns) in enumerate(((2, slice(6, 12)), (0, slice(6)))):
         before = Rotation.from_quat(given.poses[pose][:4])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.solver.test_covariance import Joint, covariance_of_all, joint, model, variable
 
 from rangesfm.solver.covariance import JointCovariance
-from rangesfm.solver.part_errors import PartSteps, map_errors
+from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
 from rangesfm.util.geometry.map_errors import MapErrors, MapPointErrors
 
 Array = npt.NDArray[np.float64]
@@ -144,14 +144,13 @@ def of_all_numbers(parts: list[PartSteps], covariance: Array) -> Array:
 def errors_of(
     parts: list[PartSteps], covariance: Array, of_scale: Array | None = None, scale_stddev: float = 0.0
 ) -> MapErrors:
-    widths = {part.start: part.by_step.shape[1] for part in parts}
-    slopes = np.zeros(len(covariance)) if of_scale is None else of_scale
+    widths, steps = {part.start: part.by_step.shape[1] for part in parts}, steps_of(parts, len(covariance))
+    by_scale = np.zeros(steps.shape[1]) if of_scale is None else steps.T @ covariance @ of_scale / scale_stddev**2
     return map_errors(
         parts,
-        len(covariance),
-        lambda right: covariance @ right,
-        lambda start: covariance[start : start + widths[start], start : start + widths[start]],
-        slopes,
+        lambda right: steps.T @ (covariance @ (steps @ right)),
+        [part.covariance(lambda at: covariance[at : at + widths[at], at : at + widths[at]]) for part in parts],
+        by_scale,
         scale_stddev,
     )
 

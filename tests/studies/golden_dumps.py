@@ -295,13 +295,8 @@ def covariances_of(metric: MetricResult) -> Values:
         found["covariance by positions"] = metric.all_measured.posterior.place
     joint = None if metric.kept is None else metric.kept.summary.covariance
     if joint is not None:
-        found |= {
-            "covariance similarity": joint.similarity,
-            "covariance centers": joint.centers,
-            "covariance poses": joint.rig_from_world,
-            "covariance anchors": joint.anchors,
-        }
-        found |= {f"covariance block {k}": block for k, block in enumerate(joint.others)}
+        found |= {"covariance centers": joint.centers_m2(metric.trajectory.frame_ids)}
+        found |= {f"covariance {kind}s": joint.covariances(kind) for kind in joint.parts}
     return found
 
 

@@ -107,7 +107,7 @@ def place_of_map(
     found, centers_m = None if summary is None else summary.covariance, path.centers
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     if found is not None:
-        of_keyframes = found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
+        of_keyframes = found.centers_m2(path.frame_ids)
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))

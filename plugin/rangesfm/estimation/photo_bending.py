@@ -12,10 +12,8 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.vision_information import misplaced_points, model_observations
-from rangesfm.measurements.joint_map import JointMap
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import (
-    NO_STEPS,
     Bending,
     FrameSteps,
     MapBending,
@@ -30,7 +28,6 @@ from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.poses import model_poses
-from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
@@ -65,12 +62,10 @@ class PhotoBending:
     is_at_optimum: bool
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
-        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
-        parts = functions.reshape(len(by_pose), len(self.path), 6)
-        by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
-        covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
+        gradients = self.shape_by_steps(by_pose, frame_is_free=frame_is_free)
+        covariance = gradients.T @ self.photos.solve(gradients)
         found = bending_part("bending", covariance, MEDIAN_FACTOR, _SPREAD)
-        shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
+        shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else gradients.T @ self.photos.at_minimum
         return Bending(() if found is None else (found,), covariance, shift_m)
 
     def likely_steps(self, pull: Array, factor: float, *, frame_is_free: bool) -> FrameSteps:
@@ -81,20 +76,34 @@ class PhotoBending:
                 what the estimate leaves of them, measured minus predicted.
             factor: learnt bending over that expected from the photos. frame_is_free: as in ``of_functions``.
         """
-        function = without_similarity(pull[None], self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
-        parts = factor**2 * function.reshape(-1, 6)
-        by_center = parts[:, 3:] @ self.world_from_model.T / self.metres_per_unit
+        gradient = self.shape_by_steps(pull[None], frame_is_free=frame_is_free)
+        steps = factor**2 * self.photos.solve(gradient)[:, 0] + self.photos.at_minimum
         frame_ids, poses = self.photos.poses
-        steps = self.photos.likely_steps(self.frame_ids, parts[:, :3], by_center)
-        found = FrameSteps(frame_ids, steps[:, :3], steps[:, 3:])
-        turns, shifts_m = found.at(self.frame_ids)
-        of_path = similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
-        whole = of_path @ np.hstack([turns, shifts_m @ self.world_from_model / self.metres_per_unit]).ravel()
-        whole[1:4] = self.world_from_model @ whole[1:4]
-        whole[4:] = self.metres_per_unit * self.world_from_model @ whole[4:]
-        first = poses.centers[np.searchsorted(frame_ids, self.frame_ids[0])]
-        back = motions_of_poses(poses.world_from_rig, poses.centers - first) @ whole
-        return FrameSteps(frame_ids, found.turns - back[:, :3], found.shifts_m - back[:, 3:])
+        whole = self.similarity_by_steps(frame_is_free=frame_is_free).T @ steps
+        of_frames = self.photos.of_frames(steps) - motions_of_poses(poses.world_from_rig, self.from_first_m) @ whole
+        return FrameSteps(frame_ids, of_frames[:, :3], of_frames[:, 3:])
+
+    def shape_by_steps(self, by_pose: Array, *, frame_is_free: bool) -> Array:
+        """Return the derivatives (n, c) by the photos' steps of functions without those by scale and place."""
+        return self._by_steps(without_similarity(by_pose, self.path, frame_is_free=frame_is_free, is_firm=self.is_firm))
+
+    def similarity_by_steps(self, *, frame_is_free: bool) -> Array:
+        """Return the derivatives (n, 7) by the photos' steps of the map as a whole, about the path's first pose."""
+        of_path = self._by_steps(similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm))
+        turned = of_path[:, 1:].reshape(-1, 2, 3) @ self.world_from_model.T
+        turned[:, 1] *= self.metres_per_unit
+        return np.hstack([of_path[:, :1], turned.reshape(-1, 6)])
+
+    def _by_steps(self, by_pose: Array) -> Array:
+        parts = by_pose.reshape(len(by_pose), -1, 6)
+        by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
+        return self.photos.by_steps(self.frame_ids, parts[:, :, :3], by_center)
+
+    @property
+    def from_first_m(self) -> Array:
+        """(m, 3) centres of the photos' frames, from that of the first pose of the path."""
+        frame_ids, poses = self.photos.poses
+        return np.asarray(poses.centers - poses.centers[np.searchsorted(frame_ids, self.frame_ids[0])])
 
     def hold_together(self, image_names: Collection[str]) -> bool:
         """Return whether the photos determine the scale of a part of the map relative to the rest.
@@ -109,28 +118,6 @@ class PhotoBending:
             by_pose[part, 3:] = sign * off / np.sum(off**2)
         covariance = self.of_functions(by_pose.reshape(1, -1), frame_is_free=True).formal_m2
         return bool(covariance[0, 0] < _HELD**2)
-
-
-def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
-    """Return where photos and all that is measured have the frames of a map at rest, before it moves as a whole.
-
-    It is their expected bending after all that is observed: Rasmussen and Williams, "Gaussian processes for machine
-    learning", 2006, eq. 2.42. A map whose photos say nothing of it stays as it is.
-
-    Args:
-        unscaled: the path of the unscaled model. The scale of the similarity to it stays as it is.
-    """
-    problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
-    if not isinstance(bending, PhotoBending):
-        return NO_STEPS
-    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
-    # What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
-    factor, is_free = min(problem.bending_factor, LARGEST_FACTOR), known.columns.frame >= 0
-    steps = bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
-    firm_m = (at_rest.path.centers + steps.at(bending.frame_ids)[1])[bending.is_firm]
-    size = at_rest.metres_per_unit / align_points(unscaled.centers[bending.is_firm], firm_m).scale
-    from_first_m = bending.photos.poses[1].centers - at_rest.path.centers[0]
-    return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)
 
 
 def bending_of_model(

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from scipy import sparse
-from scipy.linalg import block_diag
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Indices
 from rangesfm.colmap.pieces import frames_of_largest_part
@@ -34,8 +31,9 @@ from rangesfm.solver.bundle_adjustment import (
     solve_bundle_adjustment,
     solve_until_still,
 )
-from rangesfm.solver.covariance import JointCovariance, ResidualErrors, joint_covariance
+from rangesfm.solver.covariance import joint_covariance
 from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.poses import Poses, model_poses
 
 # Largest number of solutions of the full problem, between which the noise is estimated again.
@@ -78,15 +76,6 @@ class MapAtRest:
     def is_estimated(self, block: Block) -> bool:
         """Return whether a block was free."""
         return block in self.state.blocks and not any(block in kind.fixed for kind in self.problem.kinds)
-
-    def with_learnt(self, errors: Mapping[str, object]) -> MapAtRest:
-        """Return the map with the errors that were learnt at it, by kind."""
-        return replace(
-            self,
-            problem=self.problem.replaced(
-                lambda _, kind: kind.with_learnt(errors[kind.kind]) if kind.kind in errors else kind
-            ),
-        )
 
     @property
     def converged(self) -> bool:
@@ -207,11 +196,11 @@ def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
     )
 
 
-def joint_errors(rest: MapAtRest, bending_factor: float) -> JointCovariance | None:
-    """Return the covariance of all that a map at rest has estimated (section 7); None where it is not determined.
+def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors | None:
+    """Return how the parts of a map at rest err, if each residual errs on its own; None where it is not determined.
 
     Args:
-        bending_factor: of the errors of the photos' residuals.
+        bending_factor: of the errors of all residuals.
     """
     if rest.equations is None:
         return None
@@ -221,28 +210,10 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> JointCovariance | No
             anchors=rest.added.of_kind("anchor"),
             others=rest.added.others,
             residual_stddev=bending_factor * rest.pixel_stddev,
-            errors=_errors_of_residuals(rest, bending_factor),
             anchor_ids=[name for what, name in rest.added.blocks if what == "anchor"],
             refined_params=rest.refined_params,
             firm_frame_ids=rest.firm_ids,
-        )
+        ).errors
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)
         return None
-
-
-def _errors_of_residuals(rest: MapAtRest, bending_factor: float) -> ResidualErrors:
-    """Return the errors of the measurements' residuals, in units of those of the photos."""
-    kinds, residuals = rest.problem.kinds, rest.problem.residuals(rest.state)
-    found = [(rows, kind.learnt_errors(of)) for rows, kind, of in zip(rest.added.rows, kinds, residuals, strict=True)]
-    learnt = [(rows, errors) for rows, errors in found if errors is not None]
-    priors = frozenset[Block]().union(*(errors.priors for _, errors in learnt))
-    exact = [rows for rows, kind in zip(rest.added.rows, kinds, strict=True) if kind.is_prior_of(priors)]
-    nothing = np.zeros(0, dtype=np.int64)
-    return ResidualErrors(
-        np.concatenate([nothing, *(rows for rows, _ in learnt)]),
-        csr_array(sparse.block_diag([csr_array((0, 0)), *(errors.by_error for _, errors in learnt)])),
-        block_diag(np.zeros((0, 0)), *(errors.covariance for _, errors in learnt)) / bending_factor**2,
-        np.concatenate([nothing, *exact]),
-        bending_factor**-2,
-    )

@@ -22,8 +22,8 @@ from rangesfm.measurements.ranges.errors.range_errors import Misfit, RangeErrors
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.solver.covariance import JointCovariance
 from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
@@ -122,7 +122,8 @@ class RefineSummary:
         time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
         short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
             estimated.
-        covariance: of poses, anchors and scale; None if not asked for, if the model is too large, or if ranges and
+        covariance: how poses, cameras and anchors err together; None if not asked for, if the model is too large, or
+            if ranges and
             photos leave something undetermined.
         bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
         observations: with status by the final weight of each range.
@@ -146,7 +147,7 @@ class RefineSummary:
     tags_in_cam_m: Array
     time_shift_s: float | None
     short_range_error_m: float | None
-    covariance: JointCovariance | None
+    covariance: MapErrors | None
     bending_factor: float
     observations: RangeObservations
     predicted_m: Array
@@ -181,9 +182,7 @@ class RefineSummary:
         return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
 
 
-def summarize(
-    rest: MapAtRest, given: Ranges, covariance: JointCovariance | None, bending_factor: float
-) -> RefineSummary:
+def summarize(rest: MapAtRest, given: Ranges, covariance: MapErrors | None, bending_factor: float) -> RefineSummary:
     """Summarise a refinement.
 
     Args:
@@ -226,15 +225,14 @@ def summarize(
     )
 
 
-def _with_stddevs(
-    anchors: tuple[AnchorEstimate, ...], covariance: JointCovariance | None
-) -> tuple[AnchorEstimate, ...]:
-    if covariance is None:
+def _with_stddevs(anchors: tuple[AnchorEstimate, ...], covariance: MapErrors | None) -> tuple[AnchorEstimate, ...]:
+    if covariance is None or "anchor" not in covariance.parts:
         return anchors
-    variances = np.trace(covariance.anchors, axis1=1, axis2=2) / 3
-    # Rounding leaves a negative variance where the joint equations hardly determine an anchor: then it is not known.
-    variances[variances < 0] = np.nan
+    variances = np.trace(covariance.covariances("anchor"), axis1=1, axis2=2) / 3
+    variance_of = dict(zip(covariance.parts["anchor"].ids, variances.tolist(), strict=True))
     return tuple(
-        replace(anchor, position_stddev_m=float(np.sqrt(variance))) if np.isfinite(anchor.position_m).all() else anchor
-        for anchor, variance in zip(anchors, variances, strict=True)
+        replace(anchor, position_stddev_m=float(np.sqrt(variance_of[anchor.anchor_id])))
+        if anchor.anchor_id in variance_of and np.isfinite(anchor.position_m).all()
+        else anchor
+        for anchor in anchors
     )

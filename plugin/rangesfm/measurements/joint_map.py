@@ -195,11 +195,6 @@ class KindOnMap(Located):
         del on_map, at
         yield from ()
 
-    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""
-        del on_map
-        return {}
-
     # What only kinds have that are solved with unknowns of their own, as ranges with their anchors.
 
     is_solved: ClassVar[bool] = False

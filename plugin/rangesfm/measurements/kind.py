@@ -5,10 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.lengths.tape import Marker
@@ -147,10 +146,6 @@ class Measurements(ABC):
         """Those of the blocks that are held at their start values."""
         return frozenset()
 
-    def is_prior_of(self, blocks: frozenset[Block]) -> bool:
-        """Return whether they are a prior of nothing but some of these blocks."""
-        return False
-
     def at_blocks(self, blocks: Mapping[Block, Array]) -> Self:
         """Return the measurements with other start values of their blocks."""
         return self
@@ -182,28 +177,3 @@ class Measurements(ABC):
     def log_likelihood(self, residual: Array) -> float:
         """Return how likely (g, d) residuals are, whatever the noise, to compare two maps."""
         return 0.0
-
-    def with_learnt(self, learned: object) -> Self:
-        """Return the measurements with errors that were learnt at the map at rest, of whatever type is theirs."""
-        return self
-
-    def learnt_errors(self, residual: Array) -> LearntErrors | None:
-        """Return the learnt errors of the residuals in a bundle adjustment, given (g, d) residuals at rest.
-
-        None where each residual errs on its own, as its weight says.
-        """
-        return None
-
-
-class LearntErrors(NamedTuple):
-    """Errors of n residuals that are not independent with their standard deviations.
-
-    Attributes:
-        by_error: (n, m) sparse derivatives of the residuals, in their standard deviations, by m errors.
-        covariance: (m, m) of these errors.
-        priors: blocks whose priors stand for the same errors in the estimate, and have none of their own.
-    """
-
-    by_error: csr_array
-    covariance: Array
-    priors: frozenset[Block]

@@ -34,9 +34,6 @@ class Prior(Measurements):
         """Return the prior of one block, whose numbers are independent and have these standard deviations."""
         return cls((name,), mean[None], np.diag(1 / np.broadcast_to(stddev, mean.shape)))
 
-    def is_prior_of(self, blocks: frozenset[Block]) -> bool:
-        return blocks.issuperset(self.names)
-
     @property
     def weights(self) -> Weights:
         return Weights(self.root_information[None], np.ones(1), LEAST_SQUARES)

@@ -23,7 +23,6 @@ from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
-from rangesfm.pipeline.judge_map import moved_to_estimate
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.refine_map import MergeTracks, refine_closed_map
 from rangesfm.progress import Journal, Progress
@@ -69,7 +68,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
     with sole_writer(run.survey.output.path) as output:
         if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return metric
-        if metric.kept.errors is None:
+        if metric.kept.summary.covariance is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return metric
         if why_not := matching.why_unfit(metric.final):
@@ -86,8 +85,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
         )
         before, after = metric.kept, last.metric.refined
         assert after is not None, "a refined map"
-        # The map before is compared as it would be the result.
-        path = metric.trajectory.as_in(moved_to_estimate(before, metric.trajectory).model) if closed else None
+        path = metric.trajectory.as_in(before.model) if closed else None
         loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path)
         run.journal.warn(*filter(None, [loops.warning]))
         # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
@@ -215,10 +213,10 @@ class _MetricMap(_MatchedMap):
     @cached_property
     def finder(self) -> LoopFinder | None:
         refined, path = self.metric.kept, self.metric.trajectory
-        if refined is None or refined.errors is None:
+        if refined is None or (errors := refined.summary.covariance) is None:
             return None
         seed = self.survey.output.seed
-        return LoopFinder.in_refined_map(refined.model, path, refined.errors, refined.summary.pixel_stddev, seed)
+        return LoopFinder.in_refined_map(refined.model, path, errors, refined.summary.pixel_stddev, seed)
 
     @property
     def why_broken(self) -> tuple[str, ...]:
@@ -250,7 +248,7 @@ class _UnscaledMap(_MatchedMap):
         found, at_rest, seed = joint_errors(self.at_rest, LARGEST_FACTOR), self.at_rest, self.survey.output.seed
         if found is None:
             return None
-        return LoopFinder.in_refined_map(self.model, self.trajectory, found.errors, at_rest.pixel_stddev, seed)
+        return LoopFinder.in_refined_map(self.model, self.trajectory, found, at_rest.pixel_stddev, seed)
 
     @property
     def why_broken(self) -> tuple[str, ...]:

@@ -7,26 +7,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
-from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
 from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.drift import bend
-from rangesfm.estimation.photo_bending import likely_bend
 from rangesfm.estimation.scale.scale_verdict import refuse_unknown
 from rangesfm.measurements.joint_map import Doubt, JointMap
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
-from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
+from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
-from rangesfm.util.geometry.trajectory import Trajectory
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:
@@ -101,25 +96,8 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
     return diagnosis
 
 
-def moved_to_estimate(refined: RefinedMap, unscaled: Trajectory) -> RefinedMap:
-    """Return a refined map bent and moved as a whole to its best estimate; one that is not known stays as it is.
-
-    Args:
-        unscaled: path of the unscaled model.
-    """
-    at, summary = refined.on_map, refined.summary
-    if not at.is_at_rest:
-        return refined
-    bent, model = likely_bend(at, unscaled), pycolmap.Reconstruction(refined.model)
-    for moved in (moved for each in at.kinds for moved in each.moved_ranges(at.posterior, bent)):
-        summary = summary.moved(at.estimate, *moved)
-    if len(bent.frame_ids):
-        bend(model, bent)
-    return replace(refined, model=rescale(model, at.estimate), summary=summary)
-
-
 def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
-    """Return the result with the estimate of the final map's scale, to which a refined map is moved.
+    """Return the result with the estimate of the final map's scale.
 
     Raises:
         GeometryError: the scale is less certain than asked for.
@@ -132,9 +110,8 @@ def _estimated(survey: Survey, metric: MetricResult) -> MetricResult:
             refuse_unknown(estimate.uncertainty.half_width_95, estimate.reasons, estimate.advice, survey.scale)
     except GeometryError as error:
         raise with_cause(error, at) from None
-    if (kept := metric.kept) is not None:
-        metric = replace(metric, refined=moved_to_estimate(kept, metric.trajectory))
-        estimate = estimate if at.is_at_rest else replace(estimate, value=kept.scale)
+    if metric.kept is not None and not at.is_at_rest:
+        estimate = replace(estimate, value=metric.kept.scale)
     if metric.rivals.doubts:
         estimate = replace(estimate, uncertainty=estimate.uncertainty.beside(CLOCKS, metric.rivals.stddev))
     return replace(metric, estimate=estimate)

@@ -82,11 +82,6 @@ class RefinedMap:
     why_broken: tuple[str, ...] = ()
     loops: LoopClosure | None = None
 
-    @property
-    def errors(self) -> MapErrors | None:
-        """How the parts of the map err together; None if that is not known."""
-        return None if self.summary.covariance is None else self.summary.covariance.errors
-
 
 @dataclass(frozen=True)
 class MetricResult:
@@ -188,8 +183,7 @@ class MetricResult:
         """Return the covariance (3, 3) of each keyframe's projection centre by photo; empty if it is not known."""
         if self.kept is None or (found := self.kept.summary.covariance) is None:
             return {}
-        index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
-        return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+        return dict(zip(self.trajectory.image_names, found.centers_m2(self.trajectory.frame_ids), strict=True))
 
     @property
     def upward(self) -> Array | None:
@@ -202,7 +196,7 @@ class MetricResult:
     @property
     def map_errors(self) -> MapErrors | None:
         """Return how the parts of the refined map err together; None if that is not known."""
-        return None if self.kept is None else self.kept.errors
+        return None if self.kept is None else self.kept.summary.covariance
 
     def in_site(self, site: Site) -> MetricResult:
         """Return the same result in the coordinates of a site in whose local frame it is, if they are metres."""

@@ -9,13 +9,16 @@ import numpy as np
 import pycolmap
 
 from rangesfm.colmap.reprojection import point_errors
+from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import why_broken
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.drift import bend
+from rangesfm.estimation.map_posterior import errors_at_estimate, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import by_photos
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
-from rangesfm.estimation.with_ranges import summarize
+from rangesfm.estimation.with_ranges import RefineSummary, summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
 from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
@@ -95,7 +98,7 @@ def _problem(run: SurveyRun, metric: MetricResult, *, is_refined: bool) -> MapPr
 
 
 def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricResult:
-    """Learn the errors at a map at rest, and return it as a result with its covariance."""
+    """Learn the errors at a map at rest, and return it as a result at its best estimate with its covariance."""
     options, on_map, factor = run.survey.refine, metric.estimate.on_map, 1.0
     if on_map.kinds:  # else nothing is known of the scale's error
         on_map = _measured_at_rest(run, metric, rest)
@@ -103,12 +106,10 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             on_map = on_map.without_clocks()
         factor = on_map.problem.bending_factor
         on_map = on_map.concluded()
-        for kind in on_map.kinds:
-            rest = rest.with_learnt(kind.learnt_errors(on_map))
     covariance = None
     if options.covariance:
-        # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
-        covariance = joint_errors(rest, max(factor, 1.0))
+        anchor_ids = metric.observations.log.anchor_ids
+        covariance = errors_at_estimate(on_map, rest, anchor_ids) if on_map.is_at_rest else joint_errors(rest, 1.0)
         if covariance is None:
             run.journal.warn(
                 "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
@@ -128,7 +129,25 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
         scale = on_map.metres_per_unit if broken else on_map.scale.value
     else:
         scale = align_points(path.centers, path.as_in(model).centers).scale
+    if on_map.is_at_rest and not broken:
+        model, summary = _at_estimate(on_map, model, summary, path)
     return replace(metric, refined=RefinedMap(model, summary, rest.problem.kinds, on_map, scale, broken))
+
+
+def _at_estimate(
+    at_rest: JointMap, model: pycolmap.Reconstruction, summary: RefineSummary, unscaled: Trajectory
+) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+    """Return a map bent and moved as a whole to its best estimate (section 6), with its summary.
+
+    Args:
+        model: the map at rest. unscaled: path of the unscaled model.
+    """
+    bent, model = likely_bend(at_rest, unscaled), pycolmap.Reconstruction(model)
+    for moved in (moved for each in at_rest.kinds for moved in each.moved_ranges(at_rest.posterior, bent)):
+        summary = summary.moved(at_rest.estimate, *moved)
+    if len(bent.frame_ids):
+        bend(model, bent)
+    return rescale(model, at_rest.estimate), summary
 
 
 def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
@@ -147,7 +166,7 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
         if sides.has_crossed:
             again = refine_map(run, replace(start, estimate=estimate))
             return metric if again.kept is None else again
-        summary = replace(summary, anchors=sides.applied_to(summary.anchors))
+        summary = replace(summary, anchors=sides.moved(at.estimate).applied_to(summary.anchors))
     return replace(metric, estimate=estimate, refined=replace(metric.kept, summary=summary))
 
 

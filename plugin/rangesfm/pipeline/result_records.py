@@ -171,7 +171,7 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
         "correlation_inflation": summary.errors.inflation,
         "converged": summary.converged,
         "scale_value": found.refined.scale,
-        "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
+        "relative_scale_stddev": None if covariance is None else covariance.scale_stddev,
         "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
         "time_offset_change_s": summary.time_shift_s,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -14,7 +15,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.solver.linear_solver import factor
 from rangesfm.solver.nested_dissection import NestedFactor, SingularError
 from rangesfm.solver.normal_equations import HALF_A_REVOLUTION, BlockColumns, NormalEquations, address, rotation_of
-from rangesfm.solver.part_errors import PartSteps, map_errors
+from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.poses import Poses
@@ -23,25 +24,6 @@ from rangesfm.util.geometry.similarity import similarity_motions
 
 # Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
 _MIN_PIVOT = 1e-13
-
-
-@dataclass(frozen=True)
-class ResidualErrors:
-    """Errors of residuals that are not independent with the problem's standard deviation.
-
-    Attributes:
-        rows: (k,) indices of these residuals in the problem; they are no reprojection errors.
-        by_error: (k, m) sparse derivatives by m errors, in standard deviations of the residuals.
-        covariance: (m, m) of these errors, which replace those of the residuals.
-        exact: indices of residuals without errors: priors of errors that ``covariance`` has already.
-        variance_of_others: variance of all other residuals that are no reprojection errors, such as priors.
-    """
-
-    rows: Indices
-    by_error: csr_array
-    covariance: Array
-    exact: Indices
-    variance_of_others: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,19 +65,15 @@ def joint_covariance(
     anchors: Sequence[Array] = (),
     others: Sequence[Array] = (),
     residual_stddev: float = 1.0,
-    errors: ResidualErrors | None = None,
     anchor_ids: Sequence[str] | None = None,
     refined_params: Mapping[int, Sequence[int]] | None = None,
     firm_frame_ids: Indices | None = None,
 ) -> JointCovariance:
     """Compute covariances to first order: the inverse of the normal equations J^T J.
 
-    If the covariance S of the residuals is not the identity, the result is (J^T J)^-1 J^T S J (J^T J)^-1.
-
     Args:
         anchors, others: blocks of the problem, as ``NormalEquations.of`` had them.
         residual_stddev: standard deviation of the residuals: 1 if they are in standard deviations.
-        errors: of residuals that are not independent; None: all are.
         anchor_ids: names of the anchors in the map's errors; None: their indices.
         refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
             here are adjusted as a whole or not at all.
@@ -105,27 +83,25 @@ def joint_covariance(
         GeometryError: a block is not determined by the residuals, or next to rounding the map as a whole is not.
     """
     columns, variance = equations.columns, residual_stddev**2
-    equations, inverse, spread, blocks = _solved(equations, errors)
+    equations, inverse, blocks = _solved(equations)
     turns = [2.0 * np.sqrt(variance * np.trace(columns.covariance(pose, blocks)[:3, :3])) for pose in columns.poses]
     if np.median(turns) > HALF_A_REVOLUTION and not inverse.free.shape[1]:
-        equations, inverse, spread, blocks = _solved(equations.with_turns_bounded(residual_stddev), errors)
+        equations, inverse, blocks = _solved(equations.with_turns_bounded(residual_stddev))
     size, num_free_directions = inverse.free.shape
     frames = columns.frames
     poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
     turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
     to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
     names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
-    parts = [*_parts(equations, dict(zip(names, anchors, strict=True)), refined_params or {})]
+    parts = [*_parts(equations, columns, dict(zip(names, anchors, strict=True)), refined_params or {})]
+    steps = steps_of(parts, size)
     is_firm = np.ones(len(frames), dtype=bool) if firm_frame_ids is None else np.isin(frames, firm_frame_ids)
     by_similarity = _similarity_gradients(columns, is_firm, size)
-    similarity = np.full((7, 7), np.nan)
-    if np.count_nonzero(is_firm) > 1:
-        solution = inverse.solve(by_similarity)
-        similarity = variance * solution.T @ spread.times(solution)
-        if np.any(np.diag(similarity) < 0):  # as where a solver has thrown points and photos far apart
-            raise GeometryError(
-                "rounding leaves nothing of how well the map's scale and place are known: no covariance"
-            )
+    solution = variance * inverse.solve(by_similarity)
+    similarity = by_similarity.T @ solution if np.count_nonzero(is_firm) > 1 else np.full((7, 7), np.nan)
+    if np.any(np.diag(similarity) < 0):  # as where a solver has thrown points and photos far apart
+        raise GeometryError("rounding leaves nothing of how well the map's scale and place are known: no covariance")
+    by_scale = steps.T @ solution[:, 0] / similarity[0, 0] if similarity[0, 0] > 0 else np.zeros(steps.shape[1])
     return JointCovariance(
         frame_ids=frames,
         rig_from_world=turn @ poses @ turn,
@@ -136,17 +112,22 @@ def joint_covariance(
         num_free_directions=num_free_directions,
         errors=map_errors(
             parts,
-            size,
-            lambda right: variance * inverse.solve(spread.times(inverse.solve(right))),
-            lambda start: variance * blocks[columns.index_at(start)],
-            by_similarity[:, 0],
+            lambda right: variance * (steps.T @ inverse.solve(steps @ right)),
+            (part.covariance(lambda start: variance * blocks[columns.index_at(start)]) for part in parts),
+            by_scale,
             float(np.sqrt(similarity[0, 0])),
         ),
     )
 
 
 class PhotosAlone:
-    """First-order errors of poses from the photos alone: their covariance, and their distance from the minimum."""
+    """First-order errors of poses from the photos alone: their covariance, and their distance from the minimum.
+
+    Steps are those of the equations' n columns.
+
+    Attributes:
+        gradient: (n,) of half the sum of squares of the reprojection errors.
+    """
 
     def __init__(self, equations: NormalEquations, residual_stddev: float) -> None:
         """Take the photos' part of normal equations.
@@ -159,43 +140,54 @@ class PhotosAlone:
         """
         seen = equations.seen_blocks
         self._rows = equations.columns.of_blocks(seen)
-        self._columns, self._stddev = equations.columns.subset(seen), residual_stddev
-        self._gradient = equations.gradient[self._rows]
+        self._equations, self._columns = equations, equations.columns.subset(seen)
+        self.gradient, self._stddev = equations.gradient[self._rows], residual_stddev
         _, self._inverse = _held_if_loose(equations, self._inverse_of)
 
     def _inverse_of(self, equations: NormalEquations) -> _Inverse:
         rows = self._rows
         return _Inverse(equations.of_photos[rows][:, rows], equations.free_of_photos[rows], self._columns)
 
-    def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
-        """Return the errors of functions that do not depend on the place and the size of the map.
+    def solve(self, right: Array) -> Array:
+        """Return the covariance of the steps times (n, k)."""
+        return self._stddev**2 * self._inverse.solve(right)
+
+    def blocks(self) -> Callable[[int], Array]:
+        """Return a function that returns the covariance of the steps of one block, by the first of its columns."""
+        found = self._inverse.diagonal_blocks()
+        return lambda start: self._stddev**2 * found[self._columns.index_at(start)]
+
+    def parts(self, refined_params: Mapping[int, Sequence[int]]) -> list[PartSteps]:
+        """Return frames, sensors and cameras by the steps; arguments as of ``joint_covariance``."""
+        return [*_parts(self._equations, self._columns, {}, refined_params)]
+
+    @cached_property
+    def at_minimum(self) -> Array:
+        """Return the (n,) steps to the minimum of the photos alone."""
+        return -self._inverse.solve(self.gradient[:, None])[:, 0]
+
+    def by_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
+        """Return the derivatives (n, c) of functions that do not depend on the place and the size of the map.
 
         Args:
             frame_ids: (k,). by_turn, by_center: (c, k, 3) derivatives by a turn of each frame's rig in its own frame,
                 and by a shift of the rig's origin.
-
-        Returns:
-            (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
         """
-        gradients = self._by_steps(frame_ids, by_turn, by_center)
-        solution = self._inverse.solve(gradients)
-        return self._stddev**2 * gradients.T @ solution, -solution.T @ self._gradient
-
-    def likely_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
-        """Return where the frames are likeliest to be, as (m, 6) steps of ``poses``; 0 for those that are held.
-
-        A step is a turn of the rig in its own frame, and a shift of its origin.
-
-        Args:
-            frame_ids: (k,). by_turn, by_center: (k, 3) pull of what was measured on them: minus the derivatives, as of
-                ``of_functions``, of half its sum of squares.
-        """
-        pulls = self._stddev**2 * self._by_steps(frame_ids, by_turn[None], by_center[None])[:, 0]
-        solution = self._inverse.solve(np.column_stack([pulls, -self._gradient])).sum(axis=1)
-        steps = np.zeros((len(self._columns.frames), 6))
+        gradients, place = (
+            np.zeros((len(self.gradient), len(by_turn))),
+            {f: k for k, f in enumerate(frame_ids.tolist())},
+        )
         for frame_id, pose, rows in self._free_poses():
-            steps[self._columns.frames == frame_id] = _pose_from_step(pose) @ solution[rows]
-        return steps
+            if (k := place.get(frame_id)) is not None:
+                gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T
+        return gradients
+
+    def of_frames(self, steps: Array) -> Array:
+        """Return (n,) steps as (m, 6) of ``poses``, turns of rigs in their own frames and shifts of their origins."""
+        found = np.zeros((len(self._columns.frames), 6))
+        for frame_id, pose, rows in self._free_poses():
+            found[self._columns.frames == frame_id] = _pose_from_step(pose) @ steps[rows]
+        return found
 
     @property
     def poses(self) -> tuple[Indices, Poses]:
@@ -204,51 +196,12 @@ class PhotosAlone:
         shifts = np.array([pose[4:] for pose in self._columns.poses])
         return self._columns.frames, Poses(turns, -np.einsum("mij,mj->mi", turns, shifts))
 
-    def _by_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
-        """Return the derivatives (size, c) by the steps of the equations; arguments as of ``of_functions``."""
-        gradients, place = (
-            np.zeros((len(self._gradient), len(by_turn))),
-            {f: k for k, f in enumerate(frame_ids.tolist())},
-        )
-        for frame_id, pose, rows in self._free_poses():
-            if (k := place.get(frame_id)) is not None:
-                gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T
-        return gradients
-
     def _free_poses(self) -> Iterator[tuple[int, Array, slice]]:
         """Yield the id, the pose and the rows in the equations of each frame that is not held."""
         columns = self._columns
         for frame_id, pose in zip(columns.frames.tolist(), columns.poses, strict=True):
             if (index := columns.index_of.get(address(pose))) is not None:
                 yield frame_id, pose, columns.span(index)
-
-
-@dataclass(frozen=True)
-class _Spread:
-    """J^T S J for the residuals' covariance S: ``independent + by_error @ covariance @ by_error.T``.
-
-    It is a sum, as the normal equations are, since a difference of the two would leave negative variances where
-    residuals that err together determine nearly everything.
-    """
-
-    independent: Array | csr_array
-    by_error: csr_array
-    covariance: Array
-
-    @classmethod
-    def of(cls, equations: NormalEquations, errors: ResidualErrors | None) -> _Spread:
-        others, size = equations.others, len(equations.gradient)
-        if errors is None:
-            return cls(equations.of_photos + others.T @ others, csr_array((size, 0)), np.zeros((0, 0)))
-        rows, is_alone = errors.rows - equations.num_reprojections, np.ones(others.shape[0], dtype=bool)
-        is_alone[rows] = is_alone[errors.exact - equations.num_reprojections] = False
-        alone = csr_array(others[is_alone])
-        independent = equations.of_photos + errors.variance_of_others * (alone.T @ alone)
-        return cls(independent, csr_array(others[rows].T @ errors.by_error), errors.covariance)
-
-    def times(self, right: Array) -> Array:
-        """Return the product with a matrix (size, k)."""
-        return np.asarray(self.independent @ right + self.by_error @ (self.covariance @ (self.by_error.T @ right)))
 
 
 class _Inverse:
@@ -290,36 +243,30 @@ class _Inverse:
     def _off_free(self, right: Array) -> Array:
         return np.asarray(right - self.free @ (self.free.T @ right))
 
-    def diagonal_blocks(self, spread: _Spread) -> list[Array]:
-        """Return the blocks on the diagonal of inverse @ spread @ inverse."""
+    def diagonal_blocks(self) -> list[Array]:
+        """Return the blocks on its diagonal."""
         free = self.free
-        blocks = self._factor.blocks_of_sandwich(self._scaled(spread.independent))
-        # The same without the free motions, from the product of this matrix with them.
-        of_free = self._solve_regular(np.asarray(spread.independent @ self._solve_regular(free)))
+        of_free = self._solve_regular(free)
         of_free -= 0.5 * free @ (free.T @ of_free)
-        by_error = self.solve(spread.by_error.toarray())
-        of_errors = by_error @ spread.covariance
         return [
             self._scale[rows] * block * self._scale[rows].T
             - of_free[rows] @ free[rows].T
             - free[rows] @ of_free[rows].T
-            + of_errors[rows] @ by_error[rows].T
-            for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
+            for block, rows in zip(
+                self._factor.blocks_of_inverse(), map(slice, self._starts[:-1], self._starts[1:]), strict=True
+            )
         ]
 
 
-def _solved(
-    equations: NormalEquations, errors: ResidualErrors | None
-) -> tuple[NormalEquations, _Inverse, _Spread, list[Array]]:
-    """Return the equations, perhaps with loose poses held, their inverse, the spread, and the blocks' covariances."""
+def _solved(equations: NormalEquations) -> tuple[NormalEquations, _Inverse, list[Array]]:
+    """Return the equations, perhaps with loose poses held, their inverse, and the blocks' covariances."""
     equations, inverse = _held_if_loose(equations, _joint_inverse)
-    spread = _Spread.of(equations, errors)
-    blocks = inverse.diagonal_blocks(spread)
+    blocks = inverse.diagonal_blocks()
     if any(np.any(np.diag(block) < 0) for block in blocks):  # a pose is so loose that rounding leaves no digit of it
         equations = equations.with_loose_poses_held()
-        inverse, spread = _joint_inverse(equations), _Spread.of(equations, errors)
-        blocks = inverse.diagonal_blocks(spread)
-    return equations, inverse, spread, blocks
+        inverse = _joint_inverse(equations)
+        blocks = inverse.diagonal_blocks()
+    return equations, inverse, blocks
 
 
 def _held_if_loose(
@@ -374,10 +321,13 @@ def _similarity_gradients(columns: BlockColumns, is_firm: Mask, num_rows: int) -
 
 
 def _parts(
-    equations: NormalEquations, anchors: Mapping[str, Array], refined_params: Mapping[int, Sequence[int]]
+    equations: NormalEquations,
+    columns: BlockColumns,
+    anchors: Mapping[str, Array],
+    refined_params: Mapping[int, Sequence[int]],
 ) -> Iterator[PartSteps]:
-    """Yield the parts of the map that places of points depend on."""
-    columns, reconstruction, size_m = equations.columns, equations.reconstruction, equations.size_m
+    """Yield the parts of the map that places of points depend on, by some of the columns of its equations."""
+    reconstruction, size_m = equations.reconstruction, equations.size_m
 
     def start(block: Array) -> int | None:
         index = columns.index_of.get(address(block))

@@ -11,7 +11,7 @@ factor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement, pairwise, product
 from typing import NamedTuple
@@ -233,16 +233,6 @@ class NestedFactor:
             _Shape(place[_columns_of([f.own, f.boundary], starts)], int(sizes[f.own].sum()), f.children) for f in fronts
         ]
         self._starts, self._place, self._eliminated = starts, place, list[_Eliminated]()
-        self._from_below(matrix, self._eliminate)
-        squares = [np.square(np.diag(front.lower)) for front in self._eliminated]
-        self.pivots = np.concatenate([np.zeros(0), *squares])[place]
-
-    def _from_below(self, matrix: Array | csr_array, rest_of: Callable[[int, Array], Array]) -> None:
-        """Assemble a symmetric matrix front by front, in its upper triangle.
-
-        Args:
-            rest_of: returns what a front adds to the next one, on its rest; only the upper triangle counts.
-        """
         rests = dict[int, Array]()
         for number, shape in enumerate(self._shapes):
             full = matrix if isinstance(matrix, np.ndarray) else self._rows_of_front(matrix, shape)
@@ -251,7 +241,9 @@ class NestedFactor:
                 runs = shape.runs_of(self._shapes[child])
                 for (rows, of_rows), (columns, of_columns) in combinations_with_replacement(runs, 2):
                     full[rows, columns] += rest[of_rows, of_columns]
-            rests[number] = rest_of(number, full)
+            rests[number] = self._eliminate(shape, full)
+        squares = [np.square(np.diag(front.lower)) for front in self._eliminated]
+        self.pivots = np.concatenate([np.zeros(0), *squares])[place]
 
     def _rows_of_front(self, matrix: csr_array, shape: _Shape) -> Array:
         """Return a front with the rows of a matrix that are eliminated in it, (size, size), of which the rest is 0."""
@@ -262,8 +254,8 @@ class NestedFactor:
         full[rows.row[is_later], np.searchsorted(shape.columns, column[is_later])] = rows.data[is_later]
         return full
 
-    def _eliminate(self, number: int, full: Array) -> Array:
-        shape = self._shapes[number]
+    def _eliminate(self, shape: _Shape, full: Array) -> Array:
+        """Eliminate a front, and return what it adds to the next one, on its rest; only the upper triangle counts."""
         own = slice(shape.num_own)
         # The matrix is symmetric, so its transpose has the memory order of LAPACK. SciPy's own function reports the
         # failing column only in a text that differs between versions.
@@ -286,70 +278,36 @@ class NestedFactor:
             found[shape.own] = front.solved(found[shape.own] - front.tie @ found[shape.rest], transposed=True)
         return found[self._place].reshape(right.shape)
 
-    def blocks_of_sandwich(self, between: Array | csr_array) -> list[Array]:
-        """Return the diagonal blocks of inverse @ between @ inverse.
-
-        Args:
-            between: (size, size), symmetric, with no entries where the factored matrix has none.
-        """
-        changes = self._changes(between)
+    def blocks_of_inverse(self) -> list[Array]:
+        """Return the diagonal blocks of the inverse."""
         blocks: list[Array] = [np.zeros((0, 0))] * (len(self._starts) - 1)
         parent_of = {child: number for number, shape in enumerate(self._shapes) for child in shape.children}
         of_fronts = dict[int, Array]()
         for number in reversed(range(len(self._shapes))):
             shape = self._shapes[number]
-            both = np.empty((2,) + (len(shape.columns),) * 2)
+            whole = np.empty((len(shape.columns),) * 2)
             if (parent := parent_of.get(number)) is not None:
-                of_rest = both[:, shape.num_own :, shape.num_own :]
+                of_rest = whole[shape.num_own :, shape.num_own :]
                 for (rows, of_rows), (columns, of_columns) in product(self._shapes[parent].runs_of(shape), repeat=2):
-                    of_rest[:, of_rows, of_columns] = of_fronts[parent][:, rows, columns]
+                    of_rest[of_rows, of_columns] = of_fronts[parent][rows, columns]
                 if number == self._shapes[parent].children[0]:  # the last one that needs it
                     del of_fronts[parent]
-            _upwards(self._eliminated[number], *changes.pop(), both)
+            _upwards(self._eliminated[number], whole)
             for block in np.unique(np.searchsorted(self._starts, self._order[shape.own], side="right") - 1).tolist():
                 places = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
-                blocks[block] = both[1][np.ix_(places, places)]
+                blocks[block] = whole[np.ix_(places, places)]
             if shape.children:
-                of_fronts[number] = both
+                of_fronts[number] = whole
         return blocks
 
-    def _changes(self, matrix: Array | csr_array) -> list[tuple[Array, Array]]:
-        """Return the parts (m, m), (m, rest) by which each front changes if a multiple of a matrix is added."""
-        changes: list[tuple[Array, Array]] = []
 
-        def rest_of(number: int, full: Array) -> Array:
-            num, front = self._shapes[number].num_own, self._eliminated[number]
-            upper, tie, rest = full[:num, :num], full[:num, num:].copy(), full[num:, num:]
-            own = np.triu(upper) + np.triu(upper, 1).T
-            changes.append((own, tie))
-            if not rest.size:
-                return rest
-            by_rest = front.solved(front.tie, transposed=True)
-            crossed = tie - 0.5 * own @ by_rest
-            return np.asarray(linalg.blas.dsyr2k(-1.0, crossed, by_rest, 1.0, rest.T, trans=1, lower=1).T)
-
-        self._from_below(matrix, rest_of)
-        return changes
-
-
-def _upwards(front: _Eliminated, own_change: Array, tie_change: Array, both: Array) -> None:
-    """Complete inverse, and inverse @ matrix @ inverse, of a whole front, of which the part of the rest is known.
-
-    The second one is minus the derivative of the first one as a multiple of the matrix is added.
-
-    Args:
-        own_change, tie_change: derivatives of the front's parts. both: (2, size, size) the two results.
-    """
+def _upwards(front: _Eliminated, whole: Array) -> None:
+    """Complete the inverse (size, size) of a whole front, of which the part of the rest is known."""
     own, rest = slice(len(front.lower)), slice(len(front.lower), None)
-    of_own = front.inverse()
     by_rest = front.solved(front.tie, transposed=True)
-    by_rest_change = of_own @ (tie_change - own_change @ by_rest)
-    both[:, own, rest] = -by_rest @ both[:, rest, rest]
-    both[1, own, rest] += by_rest_change @ both[0, rest, rest]
-    both[:, rest, own] = np.swapaxes(both[:, own, rest], 1, 2)
-    both[:, own, own] = -both[:, own, rest] @ by_rest.T
-    both[0, own, own] += of_own
-    both[1, own, own] += of_own @ own_change @ of_own + both[0, own, rest] @ by_rest_change.T
+    whole[own, rest] = -by_rest @ whole[rest, rest]
+    whole[rest, own] = whole[own, rest].T
+    whole[own, own] = front.inverse() - whole[own, rest] @ by_rest.T
 
 
 def _tied_blocks(matrix: csr_array, starts: Indices) -> csr_array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,37 +39,35 @@ class PartSteps(NamedTuple):
     by_step: Array
     unit: Array
 
+    def covariance(self, of_columns: Callable[[int], Array]) -> Array:
+        """Return the (d, d) covariance of its numbers, by that of its columns, given the first of these."""
+        if self.start is None:
+            return np.zeros((len(self.unit), len(self.unit)))
+        return np.asarray(self.by_step @ of_columns(self.start) @ self.by_step.T)
+
 
 def map_errors(
     parts: Sequence[PartSteps],
-    num_columns: int,
     product: Callable[[Array], Array],
-    block: Callable[[int], Array],
-    of_scale: Array,
+    blocks: Iterable[Array],
+    by_scale: Array,
     scale_stddev: float,
 ) -> MapErrors:
     """Return how the parts of a map err together.
 
     Args:
         parts: all parts, those of one kind with the same number of numbers.
-        num_columns: of the normal equations.
-        product: covariance of all columns times (num_columns, k).
-        block: covariance of the columns of one part, by the first of them.
-        of_scale: (num_columns,) derivative of the logarithm of the map's scale.
-        scale_stddev: its standard deviation.
+        product: covariance of all numbers of all parts times (numbers, k).
+        blocks: (d, d) covariance of the numbers of each part.
+        by_scale: (numbers,) expected change where the logarithm of the map's scale changes by 1.
+        scale_stddev: standard deviation of that logarithm.
     """
-    steps = _all_steps(parts, num_columns)
     unit = np.concatenate([np.zeros(0), *(part.unit for part in parts)])
     in_metres = diags_array(unit)
-    modes = _largest_modes(lambda right: in_metres @ (steps.T @ product(steps @ (in_metres @ right))), len(unit))
+    modes = _largest_modes(lambda right: in_metres @ product(in_metres @ right), len(unit))
     modes /= unit[:, None]
-    by_scale = np.zeros(len(unit))
-    if scale_stddev > 0:
-        by_scale = steps.T @ product(of_scale[:, None])[:, 0] / scale_stddev**2
-    ends = np.cumsum([0, *(len(part.unit) for part in parts)])
-    rests = [
-        _rest(part, block, modes[first:last]) for part, first, last in zip(parts, ends[:-1], ends[1:], strict=True)
-    ]
+    rows = rows_of(parts)
+    rests = [_rest(block, modes[own]) for block, own in zip(blocks, rows, strict=True)]
     kinds: dict[Kind, list[int]] = {}
     for k, part in enumerate(parts):
         kinds.setdefault(part.kind, []).append(k)
@@ -76,9 +75,9 @@ def map_errors(
         {
             kind: PartErrors(
                 tuple(parts[k].id_ for k in members),  # type: ignore[arg-type]
-                np.array([modes[ends[k] : ends[k + 1]] for k in members]),
+                np.array([modes[rows[k]] for k in members]),
                 np.array([rests[k] for k in members]),
-                np.array([by_scale[ends[k] : ends[k + 1]] for k in members]),
+                np.array([by_scale[rows[k]] for k in members]),
             )
             for kind, members in kinds.items()
         },
@@ -86,7 +85,13 @@ def map_errors(
     )
 
 
-def _all_steps(parts: Sequence[PartSteps], num_columns: int) -> csc_array:
+def rows_of(parts: Sequence[PartSteps]) -> list[slice]:
+    """Return the rows of each part in the numbers of all."""
+    ends = np.cumsum([0, *(len(part.unit) for part in parts)]).tolist()
+    return [slice(first, last) for first, last in itertools.pairwise(ends)]
+
+
+def steps_of(parts: Sequence[PartSteps], num_columns: int) -> csc_array:
     """Return the derivatives of all numbers of all parts by the columns, (num_columns, numbers)."""
     rows, columns, values, first = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)], 0
     for part in parts:
@@ -121,11 +126,9 @@ def _largest_modes(product: Callable[[Array], Array], size: int) -> Array:
     return modes
 
 
-def _rest(part: PartSteps, block: Callable[[int], Array], modes: Array) -> Array:
+def _rest(block: Array, modes: Array) -> Array:
     """Return the covariance of a part that the modes leave, without negative variances by rounding."""
-    if part.start is None:
-        return np.zeros((len(part.unit), len(part.unit)))
-    rest = part.by_step @ block(part.start) @ part.by_step.T - modes @ modes.T
+    rest = block - modes @ modes.T
     values, vectors = np.linalg.eigh((rest + rest.T) / 2)
     left: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return left

@@ -85,9 +85,7 @@ def test_pairs_that_look_alike_in_two_aisles_are_contradicted_by_the_ranges() ->
     rest = scaled.refined()
     covariance = joint_errors(rest, 1.0)
     assert covariance is not None
-    finder = LoopFinder.in_refined_map(
-        rest.problem.metric, scaled.trajectory, covariance.errors, rest.pixel_stddev, seed=0
-    )
+    finder = LoopFinder.in_refined_map(rest.problem.metric, scaled.trajectory, covariance, rest.pixel_stddev, seed=0)
     loops, contradicted = finder.tested(survey.alike)
     assert not loops
     assert len(contradicted) > 0.9 * len(survey.alike) > 10

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
 
 from rangesfm import solver
 from rangesfm.arrays import Array, Indices, rows_by_key
@@ -15,7 +14,6 @@ from rangesfm.measurements.kind import (
     LEAST_SQUARES,
     Block,
     ByBlock,
-    LearntErrors,
     Linearization,
     MapState,
     Measurements,
@@ -25,7 +23,7 @@ from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import MapToFit, NamedPoints, linearized
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
-from rangesfm.measurements.positions.known_positions import KnownPositions, LearntPositions
+from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.ranges.errors.noise import STRETCH_S, correlation_inflation, stretch_labels
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
@@ -57,7 +55,6 @@ class AntennaPositions(Measurements):
         factor: of the standard deviations, as residuals of a map that may bend show it.
         inflation: factor on the standard deviation of estimates from many positions, for their errors' correlation in
             time, as residuals of such a map show it.
-        learnt: errors at the map at rest; None before.
     """
 
     kind: ClassVar[str] = "position"
@@ -75,7 +72,6 @@ class AntennaPositions(Measurements):
     loss: RobustLoss
     factor: float = 1.0
     inflation: float = 1.0
-    learnt: LearntPositions | None = None
 
     @classmethod
     def on_map(
@@ -195,34 +191,6 @@ class AntennaPositions(Measurements):
     def change(self, other: AntennaPositions) -> float:
         mine, others = (of.inflation * np.maximum(of.factor, of.stated_share) for of in (self, other))
         return float(np.max(np.abs(np.log(mine / others))))
-
-    def with_learnt(self, learned: object) -> AntennaPositions:
-        assert isinstance(learned, LearntPositions), "errors of positions"
-        return replace(self, learnt=learned)
-
-    def learnt_errors(self, residual: Array) -> LearntErrors | None:
-        if self.learnt is None:
-            return None
-        group = np.array([self.learnt.group_of.get(name, -1) for name in self.names])
-        takes_part = np.flatnonzero(group >= 0)
-        by_error = self._slopes(residual) @ self._root_information / self.inflation
-        starts = np.append(0, np.cumsum(group >= 0))
-        shape = (3 * len(group), len(self.learnt.covariance_m2))
-        rows = bsr_array((by_error[takes_part], group[takes_part], starts), shape=shape)
-        return LearntErrors(csr_array(rows), self.learnt.covariance_m2, frozenset())
-
-    def _slopes(self, residual: Array) -> Array:
-        """Return (k, 3, 3) derivatives of the robust residuals, whose squared length is the loss, by whitened ones.
-
-        With g the root of the loss of the length n of a whitened residual, the robust one is ``g / n`` times it.
-        """
-        scaled = self.weights.whitened(residual)
-        lengths = np.maximum(np.linalg.norm(scaled, axis=1), 1e-300)
-        along = scaled / lengths[:, None]
-        across = np.sqrt(self.loss.rho(lengths**2)[0]) / lengths
-        more = self.loss.slopes(lengths) - across
-        slopes = across[:, None, None] * np.eye(3) + more[:, None, None] * along[:, :, None] * along[:, None]
-        return np.asarray(slopes)
 
     def log_likelihood(self, residual: Array) -> float:
         return -residual.size * float(np.log(max(self._shown(residual, 0.0), 1e-300)))

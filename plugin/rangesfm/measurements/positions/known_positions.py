@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
@@ -93,18 +93,6 @@ class KnownPositions:
     def misclosures_m(self, site_from_model: Similarity) -> Array:
         """Return the (k, 3) differences: in the map minus known."""
         return self.predicted_m(site_from_model) - self.position_m
-
-
-class LearntPositions(NamedTuple):
-    """Errors of an antenna's positions that g groups of them share, as learnt at a map at rest.
-
-    Attributes:
-        group_of: group of each position that takes part, by name.
-        covariance_m2: (3 g, 3 g) of the groups' coordinates.
-    """
-
-    group_of: Mapping[str, int]
-    covariance_m2: Array
 
 
 _SPARSE = ("by_pose", "arms_by_pose")

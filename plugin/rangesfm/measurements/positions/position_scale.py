@@ -32,7 +32,6 @@ from rangesfm.measurements.positions.known_positions import (
     LASTING_S,
     MIN_NUM_POSITIONS,
     KnownPositions,
-    LearntPositions,
 )
 from rangesfm.measurements.positions.position_tests import tests_of_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
@@ -151,16 +150,6 @@ class PositionScale(KindOnMap):
             yield MarkedPositions(names, at.points, known.position_m[marks], stddev_m[marks], {})
         if track is not None and len(others):
             yield AntennaPositions.on_map(known, others, stddev_m[others], on_map.estimate, track, at)
-
-    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock."""
-        observed = self.grouped(on_map)
-        groups, rows = observed.grouping[::3, ::3].nonzero()
-        pairs = zip(groups.tolist(), rows.tolist(), strict=True)
-        group_of = {self.known.names[row]: group for group, row in pairs if not self.known.is_mark[row]}
-        noise = on_map.problem.noise_of(POSITIONS)
-        own = (name for name in noise.names if name in ("places", FRAME) or name.startswith(POSITIONS))
-        return {"position": LearntPositions(group_of, noise.only(*own).covariance_m2)}
 
     def grouped(self, on_map: JointMap) -> GroupedPositions:
         """Return the groups of the positions on a map."""

@@ -8,21 +8,18 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 
 from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.kind import Block, ByBlock, LearntErrors, Linearization, MapState, Measurements, Weights
+from rangesfm.measurements.kind import Block, ByBlock, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RefineOptions
-from rangesfm.solver.bending import BENDS
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.robust_statistics import RobustLoss
@@ -256,21 +253,6 @@ class Ranges(Measurements):
 
     def at_blocks(self, blocks: Mapping[Block, Array]) -> Ranges:
         return replace(self, anchors=anchors_at(self.anchors, blocks))
-
-    def with_learnt(self, learned: object) -> Ranges:
-        assert isinstance(learned, LearnedErrors), "errors of ranges"
-        return replace(self, errors=replace(self.errors, learned=learned))
-
-    def learnt_errors(self, residual: Array) -> LearntErrors | None:
-        errors = self.errors
-        if errors.learned is None:
-            return None
-        learned = errors.learned.without(*BENDS)  # bending is already in the errors of the photos' residuals
-        in_residuals = np.sqrt(errors.worth) * errors.loss.slopes(residual[:, 0] / errors.stddev_m) / errors.stddev_m
-        covariance_m2, has_bin = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
-        places = (has_bin, learned.of_range[has_bin])
-        by_error = csr_array((in_residuals[has_bin], places), shape=(len(residual), len(covariance_m2)))
-        return LearntErrors(by_error, covariance_m2, frozenset(name for name, _, _ in self._shared))
 
     def like(self, other: Ranges) -> Ranges:
         return replace(self, errors=other.errors)

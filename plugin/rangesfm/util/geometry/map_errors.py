@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import block_diag
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 
 Kind = Literal["frame", "camera", "sensor", "anchor"]
 Part = tuple[Kind, int | str]
@@ -71,6 +71,17 @@ class MapErrors:
 
     parts: Mapping[Kind, PartErrors]
     scale_stddev: float
+
+    def covariances(self, kind: Kind) -> Array:
+        """Return the (k, d, d) covariance of each part of a kind; (0, 0, 0) without any."""
+        if (parts := self.parts.get(kind)) is None:
+            return np.zeros((0, 0, 0))
+        return np.asarray(parts.modes @ np.swapaxes(parts.modes, 1, 2) + parts.rests)
+
+    def centers_m2(self, frame_ids: Indices) -> Array:
+        """Return the (n, 3, 3) covariances of the origins of some frames."""
+        rows = [self.parts["frame"].row_of[frame_id] for frame_id in frame_ids.tolist()]
+        return np.asarray(self.covariances("frame")[rows, 3:, 3:])
 
     def relative(self, first: MapPointErrors, second: MapPointErrors, scale_stddev: float) -> Array:
         """Return how a point errs relative to another one.

@@ -20,7 +20,7 @@ from rangesfm.measurements.ranges.mistakes.linearized import (
 )
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
-from rangesfm.util.geometry.similarity import path_shape
+from rangesfm.util.geometry.similarity import Similarity, path_shape
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,11 @@ class AnchorSides:
     on_map: RangesOnMap
     has_crossed: bool
     mirrors_m: Mapping[str, Array | None]
+
+    def moved(self, change: Similarity) -> AnchorSides:
+        """Return them with the places on the other sides where the map was moved."""
+        places = {id_: None if at is None else change.apply(at) for id_, at in self.mirrors_m.items()}
+        return replace(self, mirrors_m=places)
 
     def applied_to(self, anchors: Iterable[AnchorEstimate]) -> tuple[AnchorEstimate, ...]:
         """Return estimates of anchors with the unknown ones on these sides."""

@@ -172,10 +172,6 @@ class RangeScale(KindOnMap):
         assert isinstance(observed, BinnedRanges), "ranges come in bins"
         return LearnedErrors.from_noise(on_map.problem.noise_of(RANGES), observed.bins)
 
-    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return these for the ranges in a bundle adjustment."""
-        return {"range": self.learnt(on_map)}
-
     def on(self, on_map: JointMap) -> RangesOnMap:
         """Return the ranges for tests: where they are on a map at rest, or where they bend one that is only scaled."""
         return ranges_on_map(self.posed, self.solution, self.bending) if on_map.is_at_rest else self._where_bent.on_map

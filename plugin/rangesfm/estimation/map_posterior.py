@@ -1,0 +1,125 @@
+"""The delivered map: its bend from the map at rest, and how its parts err (sections 6 and 7 of ``model.md``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rangesfm.arrays import Array
+from rangesfm.estimation.photo_bending import LARGEST_FACTOR, PhotoBending
+from rangesfm.estimation.refinement import MapAtRest
+from rangesfm.measurements.joint_map import JointMap
+from rangesfm.solver.bending import NO_STEPS, FrameSteps
+from rangesfm.solver.linear_map import Columns, regular
+from rangesfm.solver.normal_equations import HALF_A_REVOLUTION
+from rangesfm.solver.part_errors import PartSteps, map_errors, rows_of, steps_of
+from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.similarity import align_points, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
+
+
+def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
+    """Return where photos and all that is measured have the frames of a map at rest, before it moves as a whole.
+
+    It is their expected bending after all that is observed: Rasmussen and Williams, "Gaussian processes for machine
+    learning", 2006, eq. 2.42. A map whose photos say nothing of it stays as it is.
+
+    Args:
+        unscaled: the path of the unscaled model. The scale of the similarity to it stays as it is.
+    """
+    problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
+    if not isinstance(bending, PhotoBending):
+        return NO_STEPS
+    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
+    # What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
+    factor, is_free = min(problem.bending_factor, LARGEST_FACTOR), known.columns.frame >= 0
+    steps = bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
+    firm_m = (at_rest.path.centers + steps.at(bending.frame_ids)[1])[bending.is_firm]
+    size = at_rest.metres_per_unit / align_points(unscaled.centers[bending.is_firm], firm_m).scale
+    from_first_m = bending.from_first_m
+    return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)
+
+
+def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[str]) -> MapErrors | None:
+    """Return how the parts of a map err that was bent and moved to its best estimate (section 7 of ``model.md``).
+
+    Its photos bend it by a covariance P before anything is observed. With H the derivatives of the observations by
+    bending, A those by the map as a whole and by anchors, Q the covariance of their errors with those by bending, and
+    C that of the estimate, a function of the map with derivatives f and b by both errs by
+    f P f' - f P H' Q^-1 H P f' + (b - f P H' Q^-1 A) C (b - f P H' Q^-1 A)' (universal kriging: Rasmussen and Williams,
+    "Gaussian processes for machine learning", 2006, eq. 2.42).
+
+    Args:
+        rest: the same map, with its equations. anchor_ids: in the order of the ranges' log.
+
+    Returns:
+        None where the photos do not say how the map is bent.
+    """
+    problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
+    if not isinstance(bending, PhotoBending):
+        return None
+    columns, photos, factor = known.columns, bending.photos, min(problem.bending_factor, LARGEST_FACTOR)
+    linear, noise = problem.among(problem.is_used)
+    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
+    column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))
+    heard = [name for what, name in rest.added.blocks if what == "anchor" and name in column_of]
+    parts = [
+        *photos.parts(rest.refined_params),
+        *(PartSteps("anchor", id_, None, np.eye(3), np.ones(3)) for id_ in heard),
+    ]
+    rows, steps = rows_of(parts), steps_of(parts, len(photos.gradient))
+    motions, by_unknown = np.zeros((steps.shape[1], 7)), np.zeros((steps.shape[1], columns.num))
+    frames = photos.poses[0].tolist()
+    for part, own in zip(parts, rows, strict=True):
+        if part.kind == "frame":  # a turn about the axes of the world, and a shift of the origin
+            motions[own][:3, 1:4] = np.eye(3)
+            motions[own][3:] = similarity_motions(bending.from_first_m[[frames.index(part.id_)]])[0]
+        elif part.kind == "anchor" and (at := column_of[str(part.id_)]) >= 0:
+            by_unknown[own, at : at + 3] = np.eye(3)
+    by_unknown[:, columns.of_map] = motions[:, : len(columns.of_map)]
+
+    # Before anything is observed, with the part that is a similarity taken out of what the photos leave open.
+    is_free = columns.frame >= 0
+    of_whole, of_blocks = bending.similarity_by_steps(frame_is_free=is_free), photos.blocks()
+    by_whole = photos.solve(of_whole)
+    whole_m2, across_m2 = of_whole.T @ by_whole, steps.T @ by_whole
+
+    def bent(right: Array) -> Array:
+        found = photos.solve(steps @ right - of_whole @ (motions.T @ right))
+        return np.asarray(factor**2 * (steps.T @ found - motions @ (of_whole.T @ found)))
+
+    def bent_block(part: PartSteps, own: slice) -> Array:
+        mixed = across_m2[own] @ motions[own].T
+        block = part.covariance(of_blocks) - mixed - mixed.T + motions[own] @ whole_m2 @ motions[own].T
+        return np.asarray(factor**2 * block)
+
+    solved = photos.solve(bending.shape_by_steps(by_pose, frame_is_free=is_free))
+    across = factor**2 * (steps.T @ solved - motions @ (of_whole.T @ solved))
+    lower = np.linalg.cholesky(regular(noise.covariance_m2))
+    observed = solve_triangular(lower, across.T, lower=True)
+    left = by_unknown - observed.T @ solve_triangular(lower, linear.design, lower=True)
+    covariance = _turns_bounded(known.covariance, columns)
+    scale = columns.scale
+    return map_errors(
+        parts,
+        lambda right: bent(right) - observed.T @ (observed @ right) + left @ (covariance @ (left.T @ right)),
+        (
+            bent_block(part, own) - observed[:, own].T @ observed[:, own] + left[own] @ covariance @ left[own].T
+            for part, own in zip(parts, rows, strict=True)
+        ),
+        left @ covariance[scale] / covariance[scale, scale],
+        float(np.sqrt(covariance[scale, scale])),
+    )
+
+
+def _turns_bounded(covariance: Array, columns: Columns) -> Array:
+    """Return the covariance (p, p) of a map with the knowledge that its turn is anything up to half a revolution.
+
+    What determines a turn hardly, as that about a straight path, would otherwise leave it any number of revolutions.
+    """
+    turn = columns.of_map[1:4]
+    of_turn = covariance[:, turn]
+    known = of_turn[turn] + HALF_A_REVOLUTION**2 * np.eye(len(turn))
+    return np.asarray(covariance - of_turn @ np.linalg.solve(known, of_turn.T))
