@@ -244,7 +244,7 @@ def expected_drift_m(truth: Truth) -> float:
     model = pycolmap.Reconstruction(truth.model.reconstruction)
     problem = photos_adjuster(truth, model).problem
     covariance = joint_covariance(NormalEquations.of(problem, model, problem.num_residuals()))
-    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+    return float(np.sqrt(np.mean(np.trace(covariance.covariances("frame")[:, 3:, 3:], axis1=1, axis2=2))))
 
 
 # The map.

@@ -8,15 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.solver.test_covariance import Joint, covariance_of_all, joint, model, variable
 
-from rangesfm.solver.covariance import JointCovariance
 from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
 from rangesfm.util.geometry.map_errors import MapErrors, MapPointErrors
 
 Array = npt.NDArray[np.float64]
 
 
-def found_in(survey: Joint) -> JointCovariance:
-    return survey.covariance(anchor_ids=[f"A{k}" for k in range(len(survey.anchors))])
+def found_in(survey: Joint) -> MapErrors:
+    return survey.covariance().errors
 
 
 def center_of(frame_id: int) -> MapPointErrors:
@@ -46,7 +45,7 @@ def centers_by_steps(survey: Joint, frames: range, num_columns: int) -> Array:
 
 def test_two_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_equations() -> None:
     survey = joint(model(), hold_first=True)
-    errors = found_in(survey).errors
+    errors = found_in(survey)
     whole = covariance_of_all(survey.problem, variable(survey))
     frames = sorted(survey.reconstruction.reg_frame_ids())
     slopes = centers_by_steps(survey, range(1, len(frames)), len(whole))
@@ -64,7 +63,7 @@ def test_two_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_e
 
 def test_what_is_held_has_no_errors() -> None:
     survey = joint(model(), hold_first=True)
-    errors = found_in(survey).errors.parts["frame"]
+    errors = found_in(survey).parts["frame"]
     first = errors.row_of[min(survey.reconstruction.reg_frame_ids())]
     assert not errors.modes[first].any()
     assert not errors.rests[first].any()
@@ -75,7 +74,7 @@ def test_few_modes_leave_keyframes_about_as_certain_relative_to_each_other_as_th
 ) -> None:
     survey = joint(model(num_frames=40), hold_anchors=True)
     frames = sorted(survey.reconstruction.reg_frame_ids())
-    whole, few = found_in(survey).errors, _with_few_modes(survey, monkeypatch)
+    whole, few = found_in(survey), _with_few_modes(survey, monkeypatch)
     assert few.parts["frame"].modes.shape[2] == 40 < whole.parts["frame"].modes.shape[2]
     pairs = [(a, b) for a in frames for b in frames if a < b]
     stddevs = [np.sqrt([np.diag(relative(of, center_of(a), center_of(b))) for a, b in pairs]) for of in (whole, few)]
@@ -86,13 +85,13 @@ def test_few_modes_leave_keyframes_about_as_certain_relative_to_each_other_as_th
 
 def _with_few_modes(survey: Joint, monkeypatch: pytest.MonkeyPatch) -> MapErrors:
     monkeypatch.setattr("rangesfm.solver.part_errors.MAX_NUM_MODES", 40)
-    return found_in(survey).errors
+    return found_in(survey)
 
 
 def test_a_stated_uncertainty_of_the_scale_replaces_that_of_the_problem() -> None:
     """A scale known exactly leaves what the map errs at that scale; one known worse widens long distances."""
     survey = joint(model(), hold_first=True)
-    errors = found_in(survey).errors
+    errors = found_in(survey)
     frames = sorted(survey.reconstruction.reg_frame_ids())
     first, last = center_of(frames[0]), center_of(frames[4])
     own = errors.relative(first, last, errors.scale_stddev)
@@ -108,7 +107,7 @@ def test_a_stated_uncertainty_of_the_scale_replaces_that_of_the_problem() -> Non
 
 
 def test_the_same_problem_has_the_same_modes_each_time() -> None:
-    first, second = (found_in(joint(model(), hold_first=True)).errors for _ in range(2))
+    first, second = (found_in(joint(model(), hold_first=True)) for _ in range(2))
     for kind, errors in first.parts.items():
         assert np.array_equal(errors.modes, second.parts[kind].modes)
 

@@ -207,13 +207,11 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors | None:
     try:
         return joint_covariance(
             rest.equations,
-            anchors=rest.added.of_kind("anchor"),
-            others=rest.added.others,
+            anchors={name: block for (what, name), block in rest.added.blocks.items() if what == "anchor"},
             residual_stddev=bending_factor * rest.pixel_stddev,
-            anchor_ids=[name for what, name in rest.added.blocks if what == "anchor"],
             refined_params=rest.refined_params,
             firm_frame_ids=rest.firm_ids,
-        ).errors
+        )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)
         return None

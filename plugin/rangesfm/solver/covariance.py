@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from scipy import linalg
@@ -17,67 +17,32 @@ from rangesfm.solver.nested_dissection import NestedFactor, SingularError
 from rangesfm.solver.normal_equations import HALF_A_REVOLUTION, BlockColumns, NormalEquations, address, rotation_of
 from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
 from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.rotations import cross_matrices
-from rangesfm.util.geometry.similarity import similarity_motions
 
 # Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
 _MIN_PIVOT = 1e-13
 
 
-@dataclass(frozen=True)
-class JointCovariance:
-    """Covariances of everything that a problem estimates, from its joint normal equations.
-
-    Attributes:
-        frame_ids: (n,) registered frames, ascending.
-        rig_from_world: (n, 6, 6) of a rotation from the left (rotation vector, rad) and the translation (metres).
-        centers: (n, 3, 3) of the rig frames' origins in the world, square metres.
-        anchors: (num_anchors, 3, 3) square metres.
-        others: (k, k) of each other block, in its unit.
-        similarity: (7, 7) of the map as a whole: logarithm of the scale, turn (rad) and shift (m) about the middle of
-            the firm frames' centres, for the best similarity between their true and estimated centres.
-        num_free_directions: number of motions of the whole map that change no residual (7 without ranges and gauge).
-            Along these, covariances are those of the map that moves least (inner constraints). Constant blocks have
-            covariance 0.
-        errors: joint errors of frames, cameras, sensors of rigs and anchors.
-    """
-
-    frame_ids: Indices
-    rig_from_world: Array
-    centers: Array
-    anchors: Array
-    others: tuple[Array, ...]
-    similarity: Array
-    num_free_directions: int
-    errors: MapErrors
-
-    @property
-    def relative_scale_stddev(self) -> float:
-        """Relative standard deviation of every length in the map that is due to the scale."""
-        return float(np.sqrt(self.similarity[0, 0]))
-
-
 def joint_covariance(
     equations: NormalEquations,
     *,
-    anchors: Sequence[Array] = (),
-    others: Sequence[Array] = (),
+    anchors: Mapping[str, Array] = MappingProxyType({}),
     residual_stddev: float = 1.0,
-    anchor_ids: Sequence[str] | None = None,
-    refined_params: Mapping[int, Sequence[int]] | None = None,
+    refined_params: Mapping[int, Sequence[int]] = MappingProxyType({}),
     firm_frame_ids: Indices | None = None,
-) -> JointCovariance:
-    """Compute covariances to first order: the inverse of the normal equations J^T J.
+) -> MapErrors:
+    """Compute the covariance of all parts of a map to first order: the inverse of the normal equations J^T J.
+
+    Motions of the whole map that change no residual are left out: along these, the covariance is that of the map that
+    moves least (inner constraints). Constant blocks have covariance 0.
 
     Args:
-        anchors, others: blocks of the problem, as ``NormalEquations.of`` had them.
+        anchors: their blocks of the problem, as ``NormalEquations.of`` had them, by name.
         residual_stddev: standard deviation of the residuals: 1 if they are in standard deviations.
-        anchor_ids: names of the anchors in the map's errors; None: their indices.
         refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
             here are adjusted as a whole or not at all.
-        firm_frame_ids: of the frames that are the map as a whole; None: all.
+        firm_frame_ids: of the frames whose size is that of the map; None: all.
 
     Raises:
         GeometryError: a block is not determined by the residuals, or next to rounding the map as a whole is not.
@@ -87,36 +52,19 @@ def joint_covariance(
     turns = [2.0 * np.sqrt(variance * np.trace(columns.covariance(pose, blocks)[:3, :3])) for pose in columns.poses]
     if np.median(turns) > HALF_A_REVOLUTION and not inverse.free.shape[1]:
         equations, inverse, blocks = _solved(equations.with_turns_bounded(residual_stddev))
-    size, num_free_directions = inverse.free.shape
-    frames = columns.frames
-    poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
-    turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
-    to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
-    names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
-    parts = [*_parts(equations, columns, dict(zip(names, anchors, strict=True)), refined_params or {})]
-    steps = steps_of(parts, size)
-    is_firm = np.ones(len(frames), dtype=bool) if firm_frame_ids is None else np.isin(frames, firm_frame_ids)
-    by_similarity = _similarity_gradients(columns, is_firm, size)
-    solution = variance * inverse.solve(by_similarity)
-    similarity = by_similarity.T @ solution if np.count_nonzero(is_firm) > 1 else np.full((7, 7), np.nan)
-    if np.any(np.diag(similarity) < 0):  # as where a solver has thrown points and photos far apart
-        raise GeometryError("rounding leaves nothing of how well the map's scale and place are known: no covariance")
-    by_scale = steps.T @ solution[:, 0] / similarity[0, 0] if similarity[0, 0] > 0 else np.zeros(steps.shape[1])
-    return JointCovariance(
-        frame_ids=frames,
-        rig_from_world=turn @ poses @ turn,
-        centers=to_center @ poses @ np.swapaxes(to_center, 1, 2),
-        anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
-        others=tuple(variance * columns.covariance(block, blocks) for block in others),
-        similarity=similarity,
-        num_free_directions=num_free_directions,
-        errors=map_errors(
-            parts,
-            lambda right: variance * (steps.T @ inverse.solve(steps @ right)),
-            (part.covariance(lambda start: variance * blocks[columns.index_at(start)]) for part in parts),
-            by_scale,
-            float(np.sqrt(similarity[0, 0])),
-        ),
+    parts = [*_parts(equations, columns, anchors, refined_params)]
+    steps = steps_of(parts, len(equations.gradient))
+    is_firm = np.isin(columns.frames, columns.frames if firm_frame_ids is None else firm_frame_ids)
+    by_scale = steps.T @ (solution := variance * inverse.solve(of_scale := _scale_gradient(columns, is_firm)))
+    scale_m2 = float(of_scale[:, 0] @ solution[:, 0])
+    if scale_m2 < 0:  # as where a solver has thrown points and photos far apart
+        raise GeometryError("rounding leaves nothing of how well the map's scale is known: no covariance")
+    return map_errors(
+        parts,
+        lambda right: variance * (steps.T @ inverse.solve(steps @ right)),
+        (part.covariance(lambda start: variance * blocks[columns.index_at(start)]) for part in parts),
+        by_scale[:, 0] / scale_m2 if scale_m2 > 0 else by_scale[:, 0],
+        float(np.sqrt(scale_m2)),
     )
 
 
@@ -301,23 +249,16 @@ def _not_determined(columns: BlockColumns, column: int) -> GeometryError:
     return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
 
 
-def _similarity_gradients(columns: BlockColumns, is_firm: Mask, num_rows: int) -> Array:
-    """Return (num_rows, 7) gradients of the similarity that fits the errors of firm centres by least squares."""
+def _scale_gradient(columns: BlockColumns, is_firm: Mask) -> Array:
+    """Return the gradient (size, 1) of the scale's logarithm that fits the errors of firm centres by least squares."""
     poses = [pose for pose, counts in zip(columns.poses, is_firm, strict=True) if counts]
-    centers = np.array([-rotation_of(pose).T @ pose[4:] for pose in poses])
-    motions = similarity_motions(centers - centers.mean(axis=0))
-    # Lengths and angles get one unit. The turn about a straight path is not determined and is left out.
-    size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
-    unit = np.array([size] * 4 + [1.0] * 3)
-    in_lengths = np.einsum("nik,nij->kj", motions, motions) / np.outer(unit, unit)
-    # The turn about a straight path is not determined.
-    to_similarity = np.linalg.pinv(in_lengths, rcond=UNDETERMINED**2, hermitian=True) / np.outer(unit, unit)
-    gradients = np.zeros((num_rows, 7))
-    for pose, motion in zip(poses, motions, strict=True):
-        index = columns.index_of.get(address(pose))
-        if index is not None:
-            gradients[columns.span(index)] = _center_from_step(pose).T @ motion @ to_similarity
-    return gradients
+    centers = np.array([-rotation_of(pose).T @ pose[4:] for pose in poses]).reshape(-1, 3)
+    off = centers - centers.mean(axis=0) if len(centers) else centers
+    gradient = np.zeros((int(columns.starts[-1]), 1))
+    for pose, by_center in zip(poses, off / max(float(np.sum(off**2)), 1e-300), strict=True):
+        if (index := columns.index_of.get(address(pose))) is not None:
+            gradient[columns.span(index), 0] = by_center @ _center_from_step(pose)
+    return gradient
 
 
 def _parts(

@@ -211,9 +211,7 @@ def test_distances_of_solved_surveys_are_in_their_intervals() -> None:
         found = survey.covariance(anchor_ids=[f"A{k}" for k in range(len(ANCHORS_M))])
         anchors_m = {f"A{k}": at for k, at in enumerate(survey.anchors)}
         true_m |= {f"A{k}": at for k, at in enumerate(ANCHORS_M)}
-        map_ = MeasuredMap(
-            MapPoints(reconstruction, anchors_m, {}, 1.0), found.errors, found.relative_scale_stddev, None
-        )
+        map_ = MeasuredMap(MapPoints(reconstruction, anchors_m, {}, 1.0), found.errors, found.errors.scale_stddev, None)
         pairs = [tuple(rng.choice([*true_m], 2, replace=False).tolist()) for _ in range(30)]
         for row in map_.measure(pairs):
             low, high = row.distance_interval_m
