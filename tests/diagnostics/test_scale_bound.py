@@ -68,12 +68,9 @@ def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: L
     silent = replace(problem, residual_m=0 * problem.residual_m, prior_residual=0 * problem.prior_residual)
     inverse = np.linalg.inv(problem.errors.covariance_m2)
     for test in results_of(problem):
-        effect, seen = test.hypothesis.effect, test.hypothesis.seen
-        off_m = effect.columns if seen is None else seen
-        of_units = [
-            replace(silent, residual_m=column, prior_residual=prior)
-            for column, prior in zip(effect.columns.T, effect.priors.T, strict=True)
-        ]
+        columns, seen, num = test.hypothesis.columns, test.hypothesis.seen, len(problem.bins)
+        off_m = columns[:num] if seen is None else seen
+        of_units = [replace(silent, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
         left = np.stack([Factorization(made).residual for made in of_units], axis=1)
         directions = np.random.default_rng(0).standard_normal((test.hypothesis.num, 1000))
         shares = np.sum((left @ directions) ** 2, axis=0)

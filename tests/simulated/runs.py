@@ -19,9 +19,9 @@ from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.options import ScaleOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import map_in_metres

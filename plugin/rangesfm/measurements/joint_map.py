@@ -39,7 +39,7 @@ from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, mov
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from rangesfm.measurements.ranges.mistakes.anchor_sides import AnchorSides
+    from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides
     from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 
 

@@ -128,18 +128,15 @@ def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> tuple[SurveyRu
     known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
     anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in log.tag_ids]).reshape(-1, 3)
-    if correction.longer_m is not None:
-        log = replace(log, range_m=log.range_m - _spread(correction.longer_m, rows, len(log)))
+    log = replace(log, range_m=log.range_m - _spread(correction.longer_m, rows, len(log)))
     inputs = replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
     corrected = replace(run, inputs=inputs)
     try:
-        shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(log))
+        shift_s = _spread(correction.time_shift_s, rows, len(log))
         observations = corrected.ranges_on(metric.trajectory, shift_s + metric.path.offset_s)
-        if correction.left_out is not None:
-            status = observations.status.copy()
-            status[rows[correction.left_out]] = RangeStatus.CHECK
-            observations = replace(observations, status=status)
-        path = replace(metric.path, observations=observations)
+        status = observations.status.copy()
+        status[rows[correction.left_out]] = RangeStatus.CHECK
+        path = replace(metric.path, observations=replace(observations, status=status))
         adopted = metric_map(corrected, path, refine=metric.refined is not None)
     except GeometryError as error:
         run.journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
@@ -150,8 +147,8 @@ def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> tuple[SurveyRu
     return corrected, adopted.doubted(Doubt(said))
 
 
-def _spread(values: Array, rows: Indices, num: int) -> Array:
-    """Return an array (num,) with the values (k,) at the given rows (k,), and 0 elsewhere."""
+def _spread(values: float | Array, rows: Indices, num: int) -> Array:
+    """Return an array (num,) with one value or (k,) values at the given rows (k,), and 0 elsewhere."""
     spread = np.zeros(num)
     spread[rows] = values
     return spread

@@ -301,8 +301,8 @@ def _ranges(
     errors = posed.errors.at(tags, posed.placing_stddev_m(scale))
     problem = weighted(posed.ranges, errors)
     weights = np.full(len(posed.rows), float(planned.num_alike))
-    solution = Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
-    found = binned_ranges(posed, solution, max_num_bins=max_num_bins, noise_m=START_STDDEV_M)
+    solution = Solution(problem, fit_at(problem, state, weights), errors, START_STDDEV_M)
+    found = binned_ranges(posed, solution, max_num_bins)
     sizes = _given_or_usual(found.components, planned.given_sizes)
     alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
     return RangesAtTruth(posed, solution, replace(found, alone_m2=alone))

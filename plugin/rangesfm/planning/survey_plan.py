@@ -15,7 +15,8 @@ from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
 from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, row_of
-from rangesfm.measurements.ranges.mistakes.linearized import linearized, ranges_on_map
+from rangesfm.measurements.ranges.mistakes.linearized import expected_with
+from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
@@ -254,8 +255,7 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     ranges, learned = expected.ranges, expected.learned
     if ranges is None or learned is None:
         return ()
-    on_map = ranges_on_map(ranges.posed, ranges.solution, None)
-    problem = replace(linearized(on_map, learned.bins), errors=learned)
+    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, None), learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):

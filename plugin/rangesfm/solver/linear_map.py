@@ -75,7 +75,8 @@ class LinearMap:
 
     def solved(self, covariance_m2: Array) -> Solved:
         """Return the solution for residuals with this (c, c) covariance."""
-        return Solved(covariance_m2, self.design, self.residual_m, self.prior_design, self.prior_residual)
+        residual = np.append(self.residual_m, self.prior_residual)
+        return Solved(covariance_m2, np.vstack([self.design, self.prior_design]), residual)
 
 
 @dataclass(frozen=True)
@@ -118,35 +119,29 @@ class EstimatedMistake:
 class Solved:
     """The decompositions of a linear problem with given errors, which its estimate and all mistakes in it share.
 
+    Its equations are those of c observations, with the covariance of their errors, and below them those of r priors,
+    in standard deviations.
+
     Attributes:
         covariance: (p, p) of the estimate; a direction that nothing determines has a huge variance.
         residual: (c + r,) whitened residuals that the unknowns leave.
     """
 
-    def __init__(
-        self,
-        covariance_m2: Array,
-        design: Array,
-        residual_m: Array,
-        prior_design: Array | None = None,
-        prior_residual: Array | None = None,
-    ):
-        prior_design = np.zeros((0, design.shape[1])) if prior_design is None else prior_design
-        prior_residual = np.zeros(len(prior_design)) if prior_residual is None else prior_residual
-        self.num_priors = len(prior_residual)
+    def __init__(self, covariance_m2: Array, design: Array, residual: Array):
         self.lower = np.linalg.cholesky(regular(covariance_m2))
-        whitened = self.whitened(design, prior_design)
+        whitened = self.whitened(design)
         lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-100)
         basis, values, turns = np.linalg.svd(whitened / lengths, full_matrices=False)
         determined, root = np.maximum(values, UNDETERMINED), turns.T / lengths[:, None]
         self.covariance = root / determined**2 @ root.T
         self._basis, self._gains = basis[:, values > UNDETERMINED], root * (values / determined**2) @ basis.T
-        self._whole = self.whitened(residual_m[:, None], prior_residual[:, None])
+        self._whole = self.whitened(residual[:, None])
         self.residual = self.left(self._whole)[:, 0]
 
-    def whitened(self, observations: Array, priors: Array) -> Array:
-        """Return effects (c, k) on observations and (r, k) on priors, in standard deviations."""
-        return np.vstack([solve_triangular(self.lower, observations, lower=True), priors])
+    def whitened(self, effects: Array) -> Array:
+        """Return effects on all residuals (c + r, k), or on the observations (c, k), in standard deviations."""
+        num = len(self.lower)
+        return np.vstack([solve_triangular(self.lower, effects[:num], lower=True), effects[num:]])
 
     def left(self, whitened: Array) -> Array:
         """Return what the unknowns cannot explain of whitened effects (c + r, k)."""
@@ -173,10 +168,9 @@ class Solved:
         num = len(self.lower)
         return solve_triangular(self.lower, self._gains[:, :num].T, lower=True, trans=1).T, self._gains[:, num:]
 
-    def mistake(self, columns: Array, priors: Array | None = None) -> EstimatedMistake:
-        """Estimate a mistake of k numbers by its effects (c, k) on the residuals and (r, k) on those of priors."""
-        priors = np.zeros((self.num_priors, columns.shape[1])) if priors is None else priors
-        whitened = self.whitened(columns, priors)
+    def mistake(self, columns: Array) -> EstimatedMistake:
+        """Estimate a mistake of k numbers by its effects (c, k) on the observations."""
+        whitened = self.whitened(np.pad(columns, ((0, len(self.residual) - len(columns)), (0, 0))))
         return self.estimated(whitened, self.left(whitened), self.by_unknowns(whitened))
 
     def estimated(self, whitened: Array, left: Array, by_unknowns: Array) -> EstimatedMistake:

@@ -8,16 +8,16 @@ from tests.known import known
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.mistakes import alternatives as module
-from rangesfm.measurements.ranges.mistakes.alternatives import Alternative
+from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 
 
-def places_of(found: Alternative) -> dict[str, list[float]]:
+def places_of(found: Hypothesis) -> dict[str, list[float]]:
     """Corrected places of anchors, rounded to a nanometre."""
-    return {name: np.round(known(at), 9).tolist() for name, at in found.correction.anchors_m.items()}
+    return {name: np.round(known(at), 9).tolist() for name, at in found.correction(np.zeros(0)).anchors_m.items()}
 
 
-def of_coordinates(given: dict[str, Array]) -> dict[str, Alternative]:
-    return {each.words: each for each in module._of_coordinates(given)}
+def of_coordinates(given: dict[str, Array]) -> dict[str, Hypothesis]:
+    return {each.words(np.zeros(0)): each for each in module._of_coordinates(given)}
 
 
 @pytest.mark.parametrize(

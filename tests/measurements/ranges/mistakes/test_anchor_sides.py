@@ -12,9 +12,9 @@ from tests.simulated.surveys import DRONE, MadeSurvey, surveyed
 from tests.studies.drifting_maps import lap_of_drift
 
 from rangesfm.measurements.joint_map import find_kind
-from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
+from rangesfm.measurements.ranges.mistakes.bent_path import likelier_sides
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.pipeline.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100

@@ -14,10 +14,10 @@ from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points, rmse

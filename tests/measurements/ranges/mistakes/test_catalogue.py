@@ -10,7 +10,8 @@ from tests.measurements.ranges.mistakes.test_linearized import ANCHORS_M, small_
 
 from rangesfm.measurements.ranges.mistakes import catalogue
 from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
-from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap, linearized
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 
 
 def placed_exactly(heights_m: tuple[float, ...] = (2.0, 1.5, 3.0)) -> RangesOnMap:
@@ -38,7 +39,7 @@ class TestTimes:
     """A radio may warm up, and clocks may differ, by amounts that can be."""
 
     def test_clocks_that_are_off_are_told_with_the_sign_of_the_offset(
-        self, problem: Linearized, standing: dict[tuple[str, str], Hypothesis]
+        self, standing: dict[tuple[str, str], Hypothesis]
     ) -> None:
         offset = standing["clock offset", ""]
         assert offset.words(np.array([-0.15])) == (
@@ -48,4 +49,3 @@ class TestTimes:
         # Otherwise they have no moment in common.
         assert offset.most == pytest.approx(9.75)
         assert offset.unit == "s"
-        assert problem.by_time is not None

@@ -15,7 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.mistakes import hypothesis_tests
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
 from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
-from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Effect, Hypothesis
+from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Hypothesis
 from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, overlap, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
@@ -34,19 +34,21 @@ def hypotheses(problem: Linearized) -> list[Hypothesis]:
     return [each for of_kind in (*STANDING, *SCANNING) for each in of_kind(problem)]
 
 
+def with_mistake(problem: Linearized, mistake: Array) -> Linearized:
+    """The problem without noise, with the effect of a mistake (c + r,) on bins and priors."""
+    num = len(problem.bins)
+    return replace(problem, residual_m=mistake[:num], prior_residual=mistake[num:])
+
+
 def without_noise(problem: Linearized) -> Linearized:
-    return replace(
-        problem,
-        residual_m=np.zeros_like(problem.residual_m),
-        prior_residual=np.zeros_like(problem.prior_residual),
-    )
+    return with_mistake(problem, np.zeros(len(problem.residual_m) + len(problem.prior_residual)))
 
 
 def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> None:
     silent = without_noise(problem)
     for each in hypotheses(problem):
         size = np.arange(1.0, each.num + 1)
-        made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+        made = with_mistake(silent, each.columns @ size)
         [test] = Factorization(made).test([each], 0)
         if np.isfinite(test.smallest_detectable):
             np.testing.assert_allclose(test.sizes, size, rtol=1e-5)
@@ -58,7 +60,7 @@ def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem
         [test] = Factorization(silent).test([each], 0)
         if each.num == 1 and np.isfinite(test.smallest_detectable):
             size = np.array([test.smallest_detectable])
-            made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+            made = with_mistake(silent, each.columns @ size)
             [found] = Factorization(made).test([each], 0)
             assert found.statistic == pytest.approx(noncentrality(1), rel=1e-4)
             moved = Factorization(made).step[0]
@@ -71,7 +73,7 @@ def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(
         direction = -np.arange(1.0, each.num + 1) / np.linalg.norm(np.arange(1.0, each.num + 1))
         for share in (0.5, 1.5):
             size = share * each.most * direction
-            made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+            made = with_mistake(silent, each.columns @ size)
             [test] = Factorization(made).test([each], 0)
             if np.isfinite(test.smallest_detectable):
                 told = row_of(test).size
@@ -83,8 +85,8 @@ def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(
 def test_hypotheses_that_explain_nearly_the_same_overlap_and_others_do_not(problem: Linearized) -> None:
     of_key = {each.key: each for each in hypotheses(problem)}
     bias, drift = of_key["common bias", ""], of_key["radio drift", ""]
-    effect = Effect.of_sum([bias.effect, Effect(0.1 * drift.effect.columns, 0.1 * drift.effect.priors)])
-    tests = Factorization(without_noise(problem)).test([bias, replace(bias, effect=effect), drift], 0)
+    both = replace(bias, columns=bias.columns + 0.1 * drift.columns)
+    tests = Factorization(without_noise(problem)).test([bias, both, drift], 0)
     assert overlap(tests[0], tests[0]) == pytest.approx(1.0)
     assert 0.9 < overlap(tests[0], tests[1]) < 1.0
     assert overlap(tests[0], tests[2]) < 0.9
@@ -95,7 +97,7 @@ def test_the_effect_of_a_large_mistake_is_that_at_its_size(problem: Linearized) 
     num = len(problem.on_map.problem.range_m)
     squared = replace(bias, correction=lambda size: Correction(longer_m=np.full(num, size[0] ** 2)))
     found = squared.at_size(problem, np.array([3.0]))
-    np.testing.assert_allclose(found.effect.columns, 6 * bias.effect.columns, rtol=1e-3)
+    np.testing.assert_allclose(found.columns, 6 * bias.columns, rtol=1e-3)
     turned = replace(bias, correction=lambda _: Correction(tag_moves_m={}))
     assert turned.at_size(problem, np.array([3.0])) is turned  # its effect is found on the map that it moves
 
@@ -118,7 +120,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
         drawn = replace(
             problem,
             residual_m=factor @ rng.standard_normal(len(factor)),
-            prior_residual=rng.standard_normal(problem.num_priors),
+            prior_residual=rng.standard_normal(len(problem.prior_residual)),
         )
         tests = Factorization(drawn).test(tried, 0)
         alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))

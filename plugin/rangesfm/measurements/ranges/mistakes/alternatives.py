@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.ranges.mistakes.hypothesis import MEASURE_AGAIN, Correction, corrected, where_ranges_meet
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
+from rangesfm.measurements.ranges.mistakes.hypothesis import (
+    MEASURE_AGAIN,
+    Correction,
+    Hypothesis,
+    corrected,
+    where_ranges_meet,
+)
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.readers.units import FOOT_M
 from rangesfm.measurements.ranges.scale.range_equation import (
@@ -20,6 +25,7 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     predicted_ranges,
     solve,
 )
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
 from rangesfm.solver.mistakes import in_axes
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
@@ -57,19 +63,8 @@ _IN_SITE = "x y z", "-x -y -z"
 _IN_CAMERA = "right down forward", "left up back"
 
 
-@dataclass(frozen=True)
-class Alternative:
-    """A mistake without a size, with its correction; the texts are as in a Hypothesis."""
-
-    name: str
-    subject: str
-    words: str
-    remedy: str
-    correction: Correction
-
-
-def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """Yield all alternatives that a map can have."""
+def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
+    """Yield all mistakes without a size that a map can have."""
     given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
     yield from _of_labels([name for name in on_map.posed.order_given if name in given], given)
@@ -77,7 +72,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
     yield from _of_places(on_map, given)
     if on_map.velocity is not None:  # as where the photos' order was taken from names that count down
         times = on_map.time_s
-        yield Alternative(
+        yield Hypothesis.without_size(
             "photos reversed",
             "",
             "the photos' times run backwards: the last photo has the time of the first",
@@ -87,7 +82,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
     yield from lever_arms_in_other_axes(on_map)
 
 
-def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
+def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
     arms = _lever_arms_m(on_map)
     for words, given in _AXES_OF_LEVER_ARM.items():
@@ -95,37 +90,39 @@ def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
         if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
             remedy = "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)"
-            yield Alternative("lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves))
+            yield Hypothesis.without_size(
+                "lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves)
+            )
 
 
-def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alternative]:
+def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Hypothesis]:
     """Yield swapped pairs of anchors' labels (or of lines in their file), and coordinates shifted by one line."""
     remedy = "compare the labels on the devices with the anchors' file"
     for one, other in combinations(given, 2):
         words = f"the labels of anchors {one} and {other} are swapped"
         swapped = Correction({one: given[other], other: given[one]})
-        yield Alternative("labels swapped", f"{one}, {other}", words, remedy, swapped)
+        yield Hypothesis.without_size("labels swapped", f"{one}, {other}", words, remedy, swapped)
     at = [given[name] for name in names]
     for by, whose in ((1, "before"), (-1, "after")) if len(names) > 2 else ():
         words = f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file"
         shifted = Correction(dict(zip(names, at[by:] + at[:by], strict=True)))
-        yield Alternative("lines shifted", "", words, remedy, shifted)
+        yield Hypothesis.without_size("lines shifted", "", words, remedy, shifted)
 
 
-def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
+def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Hypothesis]:
     """Yield other axes of the anchors' coordinates, coordinates in feet, and ranges of the way there and back."""
     remedy = "compare the anchors' file with a sketch of the site"
     for axes_words, directions in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
         words, axes = f"in the anchors' coordinates {axes_words}", _turned(directions, *_IN_SITE)
         turned = Correction({name: axes @ at for name, at in given.items()})
-        yield Alternative("anchors' axes", "", words, remedy, turned)
+        yield Hypothesis.without_size("anchors' axes", "", words, remedy, turned)
     if len(given) < 2:
         return
     middle = np.mean(list(given.values()), axis=0)
     remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
     for words, metres in _UNITS_M.items():
         grown = Correction({name: middle + metres * (at - middle) for name, at in given.items()})
-        yield Alternative("anchors' unit", "", words, remedy, grown)
+        yield Hypothesis.without_size("anchors' unit", "", words, remedy, grown)
 
 
 def _turned(given: str, along: str, against: str) -> Array:
@@ -139,7 +136,7 @@ def _turned(given: str, along: str, against: str) -> Array:
     return np.column_stack([axes[direction] for direction in given.split()])
 
 
-def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alternative]:
+def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Hypothesis]:
     """Yield for each anchor that hardly any range fits: it is far from its coordinates, as without a sign or a point.
 
     A linear test does not see this, as the ranges have no weight.
@@ -152,58 +149,59 @@ def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alte
                 f"anchor {name} is about {np.linalg.norm(off_m):.2f} m from where its coordinates say "
                 f"(by {in_axes(off_m)} in x, y, z)"
             )
-            yield Alternative("anchor place", name, words, MEASURE_AGAIN, Correction({name: None}))
+            yield Hypothesis.without_size("anchor place", name, words, MEASURE_AGAIN, Correction({name: None}))
 
 
-class Refits:
-    """Solutions of corrected problems, each started from where the map itself sees the anchors.
+def best_refits(
+    on_map: RangesOnMap, scatter_m: float, tried: Sequence[Hypothesis], num_fitted: int
+) -> list[tuple[Hypothesis, RangesOnMap]]:
+    """Return mistakes with the map corrected for each and fitted to a few ranges of each anchor, the best fit first.
 
-    They use at most ``_NUM_PER_ANCHOR`` ranges of each anchor.
+    Each fit starts from where the map itself sees the anchors.
+
+    Args:
+        scatter_m: standard deviation of a range.
+        tried: mistakes without a size. num_fitted: number of them, the likeliest before a fit, that are fitted.
     """
+    rows, nothing = spread_rows(on_map.problem, _NUM_PER_ANCHOR), np.zeros(0)
 
-    def __init__(self, on_map: RangesOnMap, scatter_m: float):
-        self._on_map = on_map
-        self._scatter_m = scatter_m
-        self._rows = spread_rows(on_map.problem, _NUM_PER_ANCHOR)
-        self._seen = _anchors_by_map(self._thinned(on_map))
+    def thinned(on_map: RangesOnMap) -> RangeProblem:
+        thin = on_map.problem.subset(rows)
+        return replace(thin, stddev_m=np.full(len(thin.range_m), scatter_m))
 
-    def _thinned(self, on_map: RangesOnMap) -> RangeProblem:
-        thin = on_map.problem.subset(self._rows)
-        return replace(thin, stddev_m=np.full(len(thin.range_m), self._scatter_m))
+    usually_seen, starts = _anchors_by_map(thinned(on_map)), []
+    for each in tried:
+        correction = each.correction(nothing)
+        right = corrected(on_map, correction)
+        thin = thinned(right)
+        seen = _anchors_by_map(thin) if np.any(correction.time_shift_s) else usually_seen
+        of_each = [(_cost(thin, state), state) for state in _starts(thin, right.state, on_map.state, *seen)]
+        cost, state = min(of_each, key=lambda start: start[0])
+        starts.append((cost, each, replace(right, state=state)))
+    fits = []
+    for _, each, right in sorted(starts, key=lambda start: start[0])[:num_fitted]:
+        fit = _roughly_solved(thinned(right), right.state)
+        fits.append((fit.cost, each, replace(right, state=fit.state)))
+    return [(each, right) for _, each, right in sorted(fits, key=lambda fit: fit[0])]
 
-    def start(self, correction: Correction) -> tuple[float, RangesOnMap]:
-        """Return the cost of the thinned ranges before any fit, and the corrected map with its best starting state."""
-        right = corrected(self._on_map, correction)
-        thin, seen = self._thinned(right), self._seen
-        if np.any(correction.time_shift_s):
-            seen = _anchors_by_map(thin)
-        starts = [(_cost(thin, state), state) for state in self._starts(thin, right.state.anchors_m, *seen)]
-        cost, state = min(starts, key=lambda each: each[0])
-        return cost, replace(right, state=state)
 
-    def fitted(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
-        """Return the cost of the best fit of the thinned ranges, and the map at that fit."""
-        fit = _roughly_solved(self._thinned(start), start.state)
-        return fit.cost, replace(start, state=fit.state)
+def _starts(
+    problem: RangeProblem, corrected: RangeState, state: RangeState, placed: Similarity, seen_m: Array
+) -> Iterator[RangeState]:
+    """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3)).
 
-    def _starts(
-        self, problem: RangeProblem, unknown_m: Array, placed: Similarity, seen_m: Array
-    ) -> Iterator[RangeState]:
-        """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3)).
-
-        Args:
-            unknown_m: (m, 3) places of the anchors whose positions are not given.
-        """
-        known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
-        anchors_m = np.where(known[:, None], problem.anchor_mean_m, unknown_m)
-        yield replace(self._on_map.state, anchors_m=anchors_m)
-        is_seen = np.asarray(np.isfinite(seen_m).all(axis=1))
-        if not problem.frame_is_free and not known.any():
-            yield RangeState(placed, np.where(is_seen[:, None], seen_m, anchors_m), self._on_map.state.bias_m)
-        usable = known & is_seen
-        if problem.frame_is_free and usable.sum() >= 3:
-            motion = align_points(seen_m[usable], anchors_m[usable])
-            yield RangeState(motion @ placed, anchors_m, self._on_map.state.bias_m)
+    Args:
+        corrected: has the places of the anchors whose positions are not given. state: before the correction.
+    """
+    known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
+    anchors_m = np.where(known[:, None], problem.anchor_mean_m, corrected.anchors_m)
+    yield replace(state, anchors_m=anchors_m)
+    is_seen = np.asarray(np.isfinite(seen_m).all(axis=1))
+    if not problem.frame_is_free and not known.any():
+        yield RangeState(placed, np.where(is_seen[:, None], seen_m, anchors_m), state.bias_m)
+    usable = known & is_seen
+    if problem.frame_is_free and usable.sum() >= 3:
+        yield RangeState(align_points(seen_m[usable], anchors_m[usable]) @ placed, anchors_m, state.bias_m)
 
 
 def _cost(problem: RangeProblem, state: RangeState) -> float:

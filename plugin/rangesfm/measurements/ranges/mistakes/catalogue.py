@@ -10,7 +10,6 @@ from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.mistakes.hypothesis import (
     MEASURE_AGAIN,
     Correction,
-    Effect,
     Hypothesis,
     duration_s,
     is_given,
@@ -51,7 +50,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
     site = problem.on_map.posed.site
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
-    most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
+    most_m = longest_m(problem, [k]) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
     seen = np.where((problem.bins.anchor_index == k)[:, None], problem.gradient.by_tag, 0.0)
 
@@ -108,7 +107,7 @@ def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whos
         words=lambda size: f"the ranges to {whose} {too_long(size)}",
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
         correction=longer(lambda: np.isin(problem.on_map.problem.anchor_index, anchors)),
-        most=max(longest_m(problem, k) for k in anchors),
+        most=longest_m(problem, anchors),
         is_linear=True,
         is_in_interval=True,
     )
@@ -155,7 +154,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
         correction=level,
         most=_MOST_SHARE_OF_ANCHOR,
         unit="1",
-        adoption=lambda _: Correction(left_out=of_ranges),
+        adoption=lambda _: Correction(left_out=np.flatnonzero(of_ranges)),
         is_linear=True,
         is_in_interval=True,
     )
@@ -170,8 +169,8 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
     middle = given_m[known].mean(axis=0)
     yield Hypothesis(
         "anchors' scale",
-        Effect.of_sum(
-            [of_anchor_place(problem, k, (given_m[k] - middle)[:, None]) for k in known if is_given(problem, k)]
+        np.sum(
+            [of_anchor_place(problem, k, (given_m[k] - middle)[:, None]) for k in known if is_given(problem, k)], axis=0
         ),
         words=lambda size: (
             f"the anchors' coordinates are about {100 * abs(size[0]):.1f} % too {'small' if size[0] > 0 else 'large'}"
@@ -195,7 +194,7 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     up, site = np.array([0.0, 0.0, 1.0]), problem.on_map.posed.site
     yield Hypothesis(
         "anchor heights",
-        Effect.of_all([of_anchor_place(problem, k, up[:, None]) for k in known]),
+        np.hstack([of_anchor_place(problem, k, up[:, None]) for k in known]),
         words=lambda size: (
             f"all anchors are given the same height, {site.height_text(given_m[known[0]])} m, but the ranges "
             f"fit heights that differ by {np.ptp(size):.1f} m"
@@ -204,7 +203,7 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
         correction=lambda size: Correction(
             {ids[k]: given_m[k] + height_m * up for k, height_m in zip(known, size, strict=True)}
         ),
-        most=longest_m(problem) * np.sqrt(len(known)),
+        most=longest_m(problem, problem.heard) * np.sqrt(len(known)),
     )
 
 
@@ -218,12 +217,10 @@ def wrong_lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     return (_lever_arm(problem, k) for k in np.unique(problem.bins.tag_index).tolist())
 
 
-def lever_arm_m(problem: Linearized, tag: int | None = None) -> float:
-    """Return the given length, metres, of a tag's lever arm, or of the longest one."""
-    on_map = problem.on_map
-    arms_m = np.linalg.norm(on_map.problem.tag_from_center, axis=1)
-    tags = np.unique(on_map.tag_index) if tag is None else [tag]
-    return max(float(np.median(arms_m[on_map.tag_index == each])) for each in tags)
+def lever_arm_m(problem: Linearized, tag: int) -> float:
+    """Return the given length, metres, of a tag's lever arm."""
+    arms_m = np.linalg.norm(problem.on_map.problem.tag_from_center, axis=1)
+    return float(np.median(arms_m[problem.on_map.tag_index == tag]))
 
 
 def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
@@ -253,7 +250,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the radio's delay changes steadily, by more than radios drift."""
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
-    lasts, unit = float(np.ptp(of_ranges)), "s" if problem.by_time is not None else "m of the path"
+    lasts, unit = float(np.ptp(of_ranges)), "m of the path" if problem.on_map.velocity is None else "s"
 
     def words(size: Array) -> str:
         how = "longer" if size[0] > 0 else "shorter"
@@ -288,16 +285,17 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
 
 def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the offset or the rate between the clocks of camera and radio differs from what is assumed."""
-    if problem.by_time is None:
+    if problem.on_map.velocity is None:
         return
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
+    by_time = problem.bins.mean(problem.on_map.by_time)
     remedy = (
         "film sharp turns at the beginning and the end, or let the offset be searched for, if you gave it "
         "(ranges_time_offset auto)"
     )
     yield Hypothesis(
         "clock offset",
-        of_bins(problem, -problem.by_time),
+        of_bins(problem, -by_time),
         words=lambda size: f"the time offset between the clocks is wrong: it needs about {size[0]:+.2f} s more",
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=float(size[0])),
@@ -306,7 +304,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "clock drift",
-        of_bins(problem, -problem.by_time * since),
+        of_bins(problem, -by_time * since),
         words=lambda size: (
             f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"
         ),

@@ -13,8 +13,9 @@ from rangesfm.measurements.ranges.mistakes.alternatives import LEAST_USED
 from rangesfm.measurements.ranges.mistakes.bent_path import drifts
 from rangesfm.measurements.ranges.mistakes.find_mistakes import Cause, Findings, find_mistakes
 from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Test, row_of
-from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap, linearized, near_m
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized, near_m
 from rangesfm.measurements.ranges.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.util.processes.threads import with_one_blas_thread
@@ -64,7 +65,7 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     shown = list(_evidence(found.problem))
     before = _before_causes(found, shown)
     seen = [row for row in shown if row.rejected and row not in before]
-    named = {(cause.name, cause.subject) for cause in found.causes}
+    named = {cause.hypothesis.key for cause in found.causes}
     others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
     rows = (*before, *map(_row_of_cause, found.causes), *seen, *others, *(row for row in shown if not row.rejected))
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *seen)]
@@ -103,9 +104,9 @@ def causes_in_words(causes: Sequence[Cause]) -> str:
     """Return the likeliest cause with its remedy as a sentence; causes that cannot be told apart are all named."""
     sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
     if len(causes) == 1:
-        return f"probably {causes[0].words} ({sure}): {causes[0].remedy}"
+        return f"probably {causes[0].words} ({sure}): {causes[0].hypothesis.remedy}"
     either = ", or ".join(cause.words for cause in causes)
-    remedies = dict.fromkeys(cause.remedy for cause in causes)
+    remedies = dict.fromkeys(cause.hypothesis.remedy for cause in causes)
     return f"either {either} ({sure}; the ranges do not tell which): {'; or '.join(remedies)}"
 
 
@@ -131,7 +132,7 @@ def _hidden_effect(test: Test) -> float:
 def _row_of_cause(cause: Cause) -> MistakeTest:
     """Return the row of a cause, with the statistic by which it was found."""
     if cause.test is None:
-        return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
+        return MistakeTest(*cause.hypothesis.key, cause.gain, cause.penalty, cause.words, cause.hypothesis.remedy)
     return row_of(replace(cause.test, statistic=_statistic(cause)))
 
 

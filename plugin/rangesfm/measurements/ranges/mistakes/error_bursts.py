@@ -7,56 +7,56 @@ a mistake of the same size at that time would explain them. They are no mistake.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Indices
 from rangesfm.measurements.ranges.errors.components import BURSTS, LASTING_S
-from rangesfm.measurements.ranges.mistakes.hypothesis import longest_m
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins
+from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis, longest_m, of_bins
 from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.solver.noise import Component
 
+# Most bursts that are left out. More of them are no exception, and are seen as noise.
+_MAX_NUM_BURSTS = 8
 
-@dataclass(frozen=True)
-class Burst:
-    """A burst, as the residuals show it.
 
-    Attributes:
-        bins: of its ranges. statistic: chi-square distributed with one degree of freedom where there is no burst.
-        threshold: of the statistic, for all possible bursts together.
+def without_bursts(problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]) -> Linearized:
+    """Leave out the bursts that explain the residuals better than any hypothesis.
+
+    Their ranges may then err by as much as a range can. The errors are learnt while the standing mistakes explain what
+    they can.
     """
-
-    bins: Indices
-    statistic: float
-    threshold: float
-
-
-def likeliest_burst(solved: Factorization) -> Burst:
-    """Return the burst that explains the residuals best."""
-    windows = _windows(solved.problem)
-    columns = np.zeros((len(solved.problem.bins), len(windows)))
+    num, windows, explaining = len(problem.bins), _windows(problem.bins), [h.columns for h in standing]
+    within = np.zeros((num, len(windows)))
     for column, window in enumerate(windows):
-        columns[window, column] = 1.0
-    left = solved.left(solved.whitened(columns, np.zeros((solved.num_priors, len(windows)))))
-    statistics = (left.T @ solved.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)) ** 2
-    best = int(np.argmax(statistics))
+        within[window, column] = 1.0
     threshold = float(special.chdtri(1, FALSE_ALARM_RATE / len(windows)))
-    return Burst(windows[best], float(statistics[best]), threshold)
+    problem = problem.with_learnt_errors(explaining)
+    for _ in range(_MAX_NUM_BURSTS):
+        factorized = Factorization(problem)
+        left = factorized.left(factorized.whitened(of_bins(problem, within)))
+        statistics = (left.T @ factorized.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)) ** 2
+        best = int(np.argmax(statistics))
+        if statistics[best] < threshold:
+            break
+        possible = (test for test in factorized.estimates(hypotheses) if test.is_possible)
+        likeliest = max((test.statistic - test.penalty(num) for test in possible), default=0.0)
+        if statistics[best] - float(np.log(num)) < likeliest:
+            break
+        burst = Component(BURSTS, np.diag(longest_m(problem, problem.heard) ** 2 * within[:, best]))
+        problem = replace(problem, components=(*problem.components, burst)).with_learnt_errors(explaining)
+    return problem
 
 
-def without(problem: Linearized, burst: Burst) -> Linearized:
-    """Return the problem with the ranges of a burst left out: they may err by as much as a range can."""
-    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), longest_m(problem) ** 2), len(problem.bins))
-    return replace(problem, components=(*problem.components, Component(BURSTS, np.diag(variances_m2))))
-
-
-def _windows(problem: Linearized) -> list[Indices]:
+def _windows(bins: RangeBins) -> list[Indices]:
     """Return the bins of all possible bursts: consecutive ones of one anchor and tag that are over in seconds."""
-    bins, found = problem.bins, []
+    found = []
     order = np.lexsort((bins.time_s, bins.tag_index, bins.anchor_index))
     link, time_s = np.stack([bins.anchor_index, bins.tag_index])[:, order], bins.time_s[order]
     for first in range(len(order)):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.ranges.anchors.point_fit import multilaterate
-from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.util.geometry.numerics import ROUNDING
 
 # Step, in the unit of a hypothesis, of the difference quotient for its effect: then rounding and curvature spoil it by
@@ -29,47 +30,25 @@ class Correction:
         anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown, and is where its ranges meet.
         tag_moves_m: (3,) additions to lever arms in the camera's frame, by tag id.
         time_shift_s: addition to the times of the ranges, one for all or (n,).
-        left_out: (n,) mask of ranges that are not used.
-        longer_m: (n,) amounts by which the ranges are too long.
+        left_out: rows of ranges that are not used.
+        longer_m: amount by which the ranges are too long, one for all or (n,).
     """
 
     anchors_m: Mapping[str, Array | None] = field(default_factory=dict)
     tag_moves_m: Mapping[str, Array] = field(default_factory=dict)
     time_shift_s: float | Array = 0.0
-    left_out: Mask | None = None
-    longer_m: Array | None = None
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Derivatives of the residuals by the k numbers of a mistake.
-
-    Attributes:
-        columns: (c, k) for the residuals of the bins, metres per unit.
-        priors: (r, k) for the residuals of the priors, in standard deviations per unit.
-    """
-
-    columns: Array
-    priors: Array
-
-    @classmethod
-    def of_all(cls, parts: Sequence[Effect]) -> Effect:
-        """Join effects that have numbers of their own."""
-        return cls(np.hstack([part.columns for part in parts]), np.hstack([part.priors for part in parts]))
-
-    @classmethod
-    def of_sum(cls, parts: Sequence[Effect]) -> Effect:
-        """Add effects that share the same numbers."""
-        return cls(np.sum([part.columns for part in parts], axis=0), np.sum([part.priors for part in parts], axis=0))
+    left_out: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    longer_m: float | Array = 0.0
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake described by k numbers.
+    """A mistake described by k numbers; by none, if it has no size and is tried as a whole.
 
     Attributes:
         name: of its kind. subject: which one of the kind, such as an anchor's id; may be empty.
-        effect: on the residuals.
+        columns: (c + r, k) derivatives by these of the residuals of the bins, metres per unit, and below them of the
+            residuals of the priors, in standard deviations per unit.
         words: returns for an estimate (k,) what is probably the case.
         remedy: what to measure or to change.
         correction: returns for an estimate the changes that undo the mistake.
@@ -77,16 +56,16 @@ class Hypothesis:
         unit: of the numbers.
         adoption: returns the changes to make if the mistake is adopted; None: those of ``correction``.
         max_unnoticed: a mistake larger than this is noticed without a test, so it need not be feared.
-        refine_time: yields the same mistake at times between those that are searched; None if it has no time.
+        refine_time: returns the same mistake at times between those that are searched; nothing if it has no time.
         sub_hypotheses: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
-        seen: (c, k) effect on the ranges if the map was known, where that differs from ``effect.columns``: an error of
-            an anchor's coordinates is an effect on their prior.
+        seen: (c, k) effect on the ranges if the map was known, where that differs from ``columns``: an error of an
+            anchor's coordinates is an effect on their prior.
         is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
     """
 
     name: str
-    effect: Effect
+    columns: Array
     words: Callable[[Array], str]
     remedy: str
     correction: Callable[[Array], Correction]
@@ -95,20 +74,25 @@ class Hypothesis:
     unit: str = "m"
     adoption: Callable[[Array], Correction] | None = None
     max_unnoticed: float = np.inf
-    refine_time: Callable[[], Iterator[Hypothesis]] | None = None
+    refine_time: Callable[[], Iterable[Hypothesis]] = tuple
     sub_hypotheses: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
     is_in_interval: bool = False
     seen: Array | None = None
 
+    @classmethod
+    def without_size(cls, name: str, subject: str, words: str, remedy: str, correction: Correction) -> Hypothesis:
+        """Return a mistake that is tried as a whole."""
+        return cls(name, np.zeros((0, 0)), lambda _: words, remedy, lambda _: correction, 0.0, subject)
+
     def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
         """Return the hypothesis with its effect linearised about an estimate, as large mistakes are not linear."""
         longer_m = self.correction(sizes).longer_m
-        if longer_m is None:
+        if not np.any(longer_m):
             return self
         steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
-        slopes = [(step - longer_m) / _SMALL for step in steps if step is not None]
-        return replace(self, effect=of_bins(problem, -problem.bins.mean(np.stack(slopes, axis=1))))
+        slopes = [(step - longer_m) / _SMALL for step in steps]
+        return replace(self, columns=of_bins(problem, -problem.bins.mean(np.stack(slopes, axis=1))))
 
     def can_be(self, sizes: Array) -> bool:
         """Return True if a mistake of this size (k,) is possible."""
@@ -121,17 +105,17 @@ class Hypothesis:
 
     @property
     def num(self) -> int:
-        return int(self.effect.columns.shape[1])
+        return int(self.columns.shape[1])
 
     @property
     def key(self) -> tuple[str, str]:
         return self.name, self.subject
 
 
-def of_bins(problem: Linearized, columns: Array) -> Effect:
-    """Return an effect on the bins alone, without a part in the priors."""
+def of_bins(problem: Linearized, columns: Array) -> Array:
+    """Return the (c + r, k) effects of (c, k) or (c,) effects on the bins alone, without a part in the priors."""
     columns = columns.reshape(len(problem.residual_m), -1)
-    return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
+    return np.pad(columns, ((0, len(problem.prior_residual)), (0, 0)))
 
 
 def is_given(problem: Linearized, anchor: int) -> bool:
@@ -140,14 +124,13 @@ def is_given(problem: Linearized, anchor: int) -> bool:
     return bool(np.isfinite(given.anchor_mean_m[anchor]).all() and np.isfinite(given.anchor_stddev_m[anchor]))
 
 
-def longest_m(problem: Linearized, anchor: int | None = None) -> float:
-    """Return the longest range to one anchor, or to any, of those that take part.
+def longest_m(problem: Linearized, anchors: Sequence[int]) -> float:
+    """Return the longest range to some anchors, of those that take part.
 
     It bounds the errors of ranges and positions: no range is too long by more than itself.
     """
     given = problem.on_map.problem
-    takes_part = problem.bins.robust_weight > 0
-    is_of = takes_part if anchor is None else takes_part & (given.anchor_index == anchor)
+    is_of = (problem.bins.robust_weight > 0) & np.isin(given.anchor_index, anchors)
     return float(np.max(given.range_m[is_of]))
 
 
@@ -156,17 +139,17 @@ def duration_s(problem: Linearized) -> float:
     return float(np.ptp(problem.on_map.time_s))
 
 
-def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect:
+def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Array:
     """Return the effect of an anchor that is off its given position along directions (3, k), towards its true place."""
     stddev_m = problem.on_map.problem.anchor_stddev_m
     if problem.columns.anchor[anchor] < 0:
         is_of = (problem.bins.anchor_index == anchor)[:, None]
         return of_bins(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
     has_rows = (problem.columns.anchor >= 0) & np.isfinite(stddev_m)
-    row = 3 * np.count_nonzero(has_rows[:anchor])
-    priors = np.zeros((problem.num_priors, directions.shape[1]))
-    priors[row : row + 3] = directions / stddev_m[anchor]
-    return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors)
+    columns = of_bins(problem, np.zeros((len(problem.bins), directions.shape[1])))
+    row = len(problem.bins) + 3 * np.count_nonzero(has_rows[:anchor])
+    columns[row : row + 3] = directions / stddev_m[anchor]
+    return columns
 
 
 def longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
@@ -191,9 +174,7 @@ def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
     on_map = replace(on_map, problem=problem, state=replace(on_map.state, anchors_m=anchors_m))
     if on_map.velocity is not None and np.any(correction.time_shift_s):
         on_map = _taken_later(on_map, np.broadcast_to(correction.time_shift_s, len(on_map.time_s)), on_map.velocity)
-    problem = on_map.problem
-    if correction.longer_m is not None:
-        problem = replace(problem, range_m=problem.range_m - correction.longer_m)
+    problem = replace(on_map.problem, range_m=on_map.problem.range_m - correction.longer_m)
     if correction.tag_moves_m:
         moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in on_map.tag_ids])
         turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.mistake_words import mistake_in_words
-from rangesfm.measurements.ranges.mistakes.hypothesis import Effect, Hypothesis
+from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
 from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, finite, row_of_mistake
@@ -42,6 +42,10 @@ class Test(EstimatedMistake):
         """Largest change of the scale's logarithm per unit of the mistake, also where none is found."""
         return float(np.linalg.norm(self.by_unknowns[0]))
 
+    def penalty(self, num_bins: int) -> float:
+        """Return the cost of the numbers that a hypothesis may choose (Schwarz, 1978)."""
+        return self.num * float(np.log(num_bins))
+
     @property
     def is_possible(self) -> bool:
         """True if a mistake of the estimated size is possible."""
@@ -62,13 +66,8 @@ class Factorization(Solved):
     """The solution of a problem, with the tests of all mistakes in it."""
 
     def __init__(self, problem: Linearized):
-        super().__init__(
-            problem.errors.covariance_m2,
-            problem.design,
-            problem.residual_m,
-            problem.prior_design,
-            problem.prior_residual,
-        )
+        residual = np.append(problem.residual_m, problem.prior_residual)
+        super().__init__(problem.errors.covariance_m2, np.vstack([problem.design, problem.prior_design]), residual)
         self.problem = problem
         # Quadratic form of the path's mean square displacement in the unknowns.
         place = problem.place.reshape(-1, problem.columns.num)
@@ -82,10 +81,9 @@ class Factorization(Solved):
         squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
         return squares + 2 * float(np.sum(np.log(np.diag(self.lower)))) + self.problem.errors.unlikeliness
 
-    def step_with(self, effect: Effect, sizes: Array) -> Array:
-        """Return the (p,) step from the state to the likeliest one, given a mistake of some size (k,)."""
-        mistake = self.whitened(effect.columns, effect.priors) @ sizes
-        return self.step - self.by_unknowns(mistake[:, None])[:, 0]
+    def step_with(self, mistake: Array) -> Array:
+        """Return the (p,) step from the state to the likeliest one, given the effect (c + r,) of a mistake."""
+        return self.step - self.by_unknowns(self.whitened(mistake[:, None]))[:, 0]
 
     def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
         """Test all hypotheses, with thresholds that hold for all together."""
@@ -95,8 +93,7 @@ class Factorization(Solved):
 
     def estimates(self, hypotheses: Sequence[Hypothesis]) -> list[Test]:
         """Test all hypotheses without thresholds."""
-        effects = Effect.of_all([h.effect for h in hypotheses])
-        whitened = self.whitened(effects.columns, effects.priors)
+        whitened = self.whitened(np.hstack([h.columns for h in hypotheses]))
         left, by_unknowns = self.left(whitened), self.by_unknowns(whitened)
         ends = np.cumsum([h.num for h in hypotheses])
         parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]

@@ -1,33 +1,20 @@
-"""RangesOnMap, the ranges of a survey on its scaled map, and Linearized, the linear problem that all tests use."""
+"""Linearized, the linear problem of a map's ranges in which all mistakes are tested (section 8 of ``model.md``)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.measurements.ranges.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
-from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
+from rangesfm.measurements.ranges.errors.components import DRIFT_S, WANDERING
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
-from rangesfm.measurements.ranges.scale.binned_ranges import ruled_out
-from rangesfm.measurements.ranges.scale.range_equation import (
-    RangeProblem,
-    RangeState,
-    antenna_positions,
-    columns_of,
-    prior_jacobian,
-    prior_residuals,
-    range_jacobian,
-    state_after,
-)
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import Solution
-from rangesfm.solver.bending import MapBending
+from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, state_after
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
@@ -52,112 +39,51 @@ _WANDERING_M = 0.025
 
 
 @dataclass(frozen=True)
-class RangesOnMap:
-    """n ranges that took part in an estimate, and its state.
-
-    Attributes:
-        posed: their scale problem.
-        problem: its ranges, corrected where a mistake is undone, with standard deviations of 1: its residuals and
-            Jacobians are in metres.
-        state: the estimate.
-        model_from_cam: (n, 3, 3) rotations into the model's world.
-        velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
-        time_s: (n,) as ``ScaleProblem.times_s``.
-        weights: (n,) robust weights in the estimate.
-        bending: of the map; None: the map is not bent.
-    """
-
-    posed: ScaleProblem
-    problem: RangeProblem
-    state: RangeState
-    model_from_cam: Array
-    velocity: Array | None
-    time_s: Array
-    weights: Array
-    bending: MapBending | None
-
-    @property
-    def anchor_ids(self) -> tuple[str, ...]:
-        return self.posed.observations.log.anchor_ids
-
-    @property
-    def tag_ids(self) -> tuple[str, ...]:
-        return self.posed.observations.log.tag_ids
-
-    @property
-    def tag_index(self) -> Indices:
-        return self.posed.observations.log.tag_index[self.posed.rows]
-
-    @property
-    def on_path(self) -> OnPath:
-        """Places of the ranges between keyframes."""
-        return self.posed.observations.on_path(self.posed.rows)
-
-    @property
-    def world_from_cam(self) -> Array:
-        """(n, 3, 3) rotations of the cameras into the metric world."""
-        turned: Array = np.einsum("ij,njk->nik", self.state.metric_from_model.rotation, self.model_from_cam)
-        return turned
-
-    @property
-    def residual_m(self) -> Array:
-        """(n,) predicted minus measured range, metres, with the prior means of the biases."""
-        biases_m = self.problem.bias_mean_m[self.problem.anchor_index]
-        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) + biases_m - self.problem.range_m)
-
-    @property
-    def from_anchor_m(self) -> Array:
-        """(n, 3) vectors from each range's anchor to its tag, in the metric world."""
-        tags_m = antenna_positions(self.problem, self.state.metric_from_model)
-        return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
-
-
-def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending | None) -> RangesOnMap:
-    """Collect the ranges of a problem at its solution."""
-    return RangesOnMap(
-        posed=posed,
-        problem=replace(posed.ranges, stddev_m=np.ones(len(posed.rows)), share=np.ones(len(posed.rows))),
-        state=solution.fit.state,
-        model_from_cam=posed.model_from_cam,
-        velocity=posed.velocity,
-        time_s=posed.times_s(solution.fit.state.metric_from_model.scale),
-        weights=solution.fit.weights,
-        bending=bending,
-    )
-
-
-@dataclass(frozen=True)
 class Linearized(LinearMap):
     """The linear problem of c bins of ranges and r priors; the anchors' biases are random errors.
 
     Its residuals are those of the map as the photos alone would have it. Priors are first those of the anchors' places.
 
     Attributes:
-        place: (c, 3, p) derivative of the tag's position in each bin.
-        bins: how ranges are averaged. time_s: (c,) mean times.
-        gradient: of the c distances.
-        by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.
-        by_time: (c,) derivative by the clocks' offset; None without times.
-        on_map: the ranges. scatter_m: standard deviation of a range among its neighbours.
+        on_map: the ranges. bins: how they are averaged.
+        scatter_m: standard deviation of a range among its neighbours.
         shift_m: (c,) change of the residuals from the map as it is to the map as the photos alone would have it.
         components: of the errors. errors: the errors assumed random.
     """
 
-    place: Array
-    bins: RangeBins
-    time_s: Array
-    gradient: RangeGradient
-    by_lever_arm: Array
-    by_time: Array | None
     on_map: RangesOnMap
+    bins: RangeBins
     scatter_m: float
     shift_m: Array
     components: tuple[Component, ...]
     errors: LearnedErrors
 
+    @cached_property
+    def time_s(self) -> Array:
+        """(c,) mean times."""
+        return self.bins.mean(self.on_map.time_s)
+
+    @cached_property
+    def gradient(self) -> RangeGradient:
+        """Of the c distances."""
+        of_ranges = self.on_map.gradient
+        return RangeGradient(self.bins.mean(of_ranges.distance_m), self.bins.mean(of_ranges.by_tag))
+
     @property
-    def num_priors(self) -> int:
-        return len(self.prior_residual)
+    def by_lever_arm(self) -> Array:
+        """(c, 3) derivatives of the residuals by the lever arm in the camera's frame."""
+        return self.bins.mean(self.on_map.gradient.by_tag_in_cam(self.on_map.world_from_cam))
+
+    @property
+    def place(self) -> Array:
+        """(c, 3, p) derivatives of the tag's position in each bin."""
+        problem, placed = self.on_map.problem, self.on_map.state.metric_from_model
+        place = np.zeros((len(self.bins), 3, self.columns.num))
+        place[:, :, self.columns.scale] = self.bins.mean(placed.scale * problem.centers @ placed.rotation.T)
+        if self.columns.frame >= 0:
+            arms_m = self.bins.mean(antenna_positions(problem, placed) - placed.translation)
+            place[:, :, self.columns.frame : self.columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
+        return place
 
     @property
     def heard(self) -> list[int]:
@@ -165,25 +91,22 @@ class Linearized(LinearMap):
         anchors: list[int] = np.unique(self.bins.anchor_index).tolist()
         return anchors
 
-    def with_learnt_errors(
-        self, columns: Array | None = None, priors: Array | None = None, near: LearnedErrors | None = None
-    ) -> Linearized:
-        """Return the problem with the errors learnt while given mistakes explain what they can.
+    def with_learnt_errors(self, mistakes: Sequence[Array] = (), near: LearnedErrors | None = None) -> Linearized:
+        """Return the problem with the errors learnt while mistakes explain what they can.
 
         Args:
-            columns, priors: (c, k) and (r, k) effects of the mistakes; None: no mistake was made.
+            mistakes: (c + r, k) effects of each on the residuals.
             near: errors of nearly the same problem, to start from, which takes half the time.
         """
-        columns = self.design[:, :0] if columns is None else columns
-        priors = self.prior_design[:, :0] if priors is None else priors
+        columns = np.hstack([np.vstack([self.design, self.prior_design]), *mistakes])
         # Residuals are taken where the priors' residuals are smallest, with the map as it is.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
         learnt = learn_errors(
             self.components,
             self.bins,
             off_m=self.design @ back - self.residual_m,
-            design=np.hstack([self.design, columns]),
-            prior_design=np.hstack([self.prior_design, priors]),
+            design=columns[: len(self.bins)],
+            prior_design=columns[len(self.bins) :],
             noise_m=self.scatter_m,
             # A radio that errs by significantly more than others was mistaken, which must not pass for noise.
             most_unusual=SIGNIFICANT_STDDEVS,
@@ -195,48 +118,76 @@ class Linearized(LinearMap):
         """Return the problem with the errors usual for radios and maps with this scatter."""
         return replace(self, errors=_usual_errors(self.components, self.bins, self.scatter_m))
 
+    def at_state(self, on_map: RangesOnMap) -> Linearized:
+        """Linearise at another state or for corrected ranges, with the same bins and errors."""
+        linear = on_map.linearized(self.bins)
+        return replace(self, **vars(linear) | {"residual_m": linear.residual_m + self.shift_m}, on_map=on_map)
 
-def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> Linearized:
+    def at_other_map(self, on_map: RangesOnMap) -> Linearized:
+        """Linearise the same ranges on another map, in the same bins, with the usual errors."""
+        return _with_usual_errors(on_map, self.bins, self.scatter_m)
+
+    def after_step(self) -> Linearized:
+        """Return the problem after a step to the likeliest state, or after a part of it.
+
+        A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height
+        above a flat path. So a step that makes the state less likely is halved.
+        """
+        solved = self.solved(self.errors.covariance_m2)
+
+        def cost(of: Linearized) -> float:
+            return float(np.sum(solved.whitened(np.append(of.residual_m, of.prior_residual)[:, None]) ** 2))
+
+        step, before = solved.step, cost(self)
+        for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):
+            state = state_after((self.columns,), self.on_map.state, share * step)
+            moved = self.at_state(replace(self.on_map, state=state))
+            if cost(moved) <= before:
+                return moved
+        return self
+
+
+def linearized(on_map: RangesOnMap) -> Linearized:
     """Linearise at the map's own state, with the usual errors.
 
-    Args:
-        bins_of_ranges: for ranges without noise; None: bins are formed from the ranges that agree with their
-            neighbours, however far they are from the map.
+    Bins are formed from the ranges that agree with their neighbours, however far they are from the map.
     """
-    return _with_usual_errors(on_map, *(_bins(on_map) if bins_of_ranges is None else (bins_of_ranges, 0.0)))
+    index = on_map.problem.anchor_index
+    order = np.lexsort((on_map.time_s, on_map.tag_index, index))
+    off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
+    agrees = np.empty(len(order), dtype=bool)
+    agrees[order] = _agree(np.abs(off_m) <= near_m(scatter_m), index[order])
+    weights = (agrees & _can_be(on_map)).astype(np.float64)
+    noise_of_anchor = noisiness(index[order], off_m, on_map.problem.num_anchors)
+    return _with_usual_errors(on_map, on_map.bins(weights, noise_of_anchor, _MAX_NUM_BINS), scatter_m)
 
 
-def at_other_map(problem: Linearized, on_map: RangesOnMap) -> Linearized:
-    """Linearise the same ranges on another map, in the same bins, with the usual errors."""
-    return _with_usual_errors(on_map, problem.bins, problem.scatter_m)
+def expected_with(on_map: RangesOnMap, errors: LearnedErrors) -> Linearized:
+    """Linearise ranges without noise, of a map that is not bent, with the errors to expect."""
+    return replace(_with_usual_errors(on_map, errors.bins, 0.0), errors=errors)
 
 
 def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
-    towards = RangeGradient.of(on_map.from_anchor_m).by_tag
-    placing_m = on_map.posed.placing_stddev_m(on_map.state.metric_from_model.scale)
-    by_places_m2 = bins.shared_by_places(towards, placing_m, on_map.on_path.before)
-    others_m2: dict[OtherError, Array] = {WANDERING: _wandering_m2(bins), PLACES: by_places_m2}
-    components = radio_components(bins, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2)
-    bending = on_map.bending
-    if bending is None:
-        shift_m = np.zeros(len(bins))
-    else:
-        by_pose = bins.by_pose(slopes_by_poses(on_map), len(bending.path))
+    components = on_map.errors_of(bins, {WANDERING: _wandering_m2(bins)})
+    linear, bending, shift_m = on_map.linearized(bins), on_map.bending, np.zeros(len(bins))
+    if bending is not None:
+        by_pose = bins.by_pose(on_map.by_poses, len(bending.path))
         bent = bending.of_functions(by_pose, frame_is_free=on_map.problem.frame_is_free)
         components, shift_m = (*components, *bent.parts), bent.shift_m
-    return _linearized(on_map, components, bins, shift_m, scatter_m, _usual_errors(components, bins, scatter_m))
-
-
-def _usual_errors(components: Sequence[Component], bins: RangeBins, scatter_m: float) -> LearnedErrors:
-    return LearnedErrors.from_noise(
-        noise_of_sizes(components, usual_sizes(components) | {"white": scatter_m}, len(bins)), bins
+    return Linearized(
+        **vars(linear) | {"residual_m": linear.residual_m + shift_m},
+        on_map=on_map,
+        bins=bins,
+        scatter_m=scatter_m,
+        shift_m=shift_m,
+        components=components,
+        errors=_usual_errors(components, bins, scatter_m),
     )
 
 
-def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
-    """Linearise the problem at another state or for corrected ranges, with the same bins and errors."""
-    of = problem
-    return _linearized(on_map, of.components, of.bins, of.shift_m, of.scatter_m, of.errors)
+def _usual_errors(components: Sequence[Component], bins: RangeBins, scatter_m: float) -> LearnedErrors:
+    sizes = usual_sizes(components) | {"white": scatter_m}
+    return LearnedErrors.from_noise(noise_of_sizes(components, sizes, len(bins)), bins)
 
 
 def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> bool:
@@ -249,95 +200,9 @@ def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> boo
     return bool(np.sqrt(np.mean(moved_m**2)) < NEGLIGIBLE_STDDEVS * scatter_m)
 
 
-def after_step(problem: Linearized) -> Linearized:
-    """Return the problem after a step to the likeliest state, or after a part of it.
-
-    A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height above
-    a flat path. So a step that makes the state less likely is halved.
-    """
-    solved = problem.solved(problem.errors.covariance_m2)
-
-    def cost(of: Linearized) -> float:
-        return float(np.sum(solved.whitened(of.residual_m[:, None], of.prior_residual[:, None]) ** 2))
-
-    step, before = solved.step, cost(problem)
-    for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):
-        state = state_after((problem.columns,), problem.on_map.state, share * step)
-        moved = at_state(problem, replace(problem.on_map, state=state))
-        if cost(moved) <= before:
-            return moved
-    return problem
-
-
-def _linearized(
-    on_map: RangesOnMap,
-    components: tuple[Component, ...],
-    bins: RangeBins,
-    shift_m: Array,
-    scatter_m: float,
-    errors: LearnedErrors,
-) -> Linearized:
-    # The anchors' biases are random errors here, not parameters.
-    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
-    state, placed = on_map.state, on_map.state.metric_from_model
-    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), bins.mean
-    by_time = None
-    if on_map.velocity is not None:
-        by_time = mean(gradient.by_log_scale(placed.scale * on_map.velocity @ placed.rotation.T))
-    place = np.zeros((len(bins), 3, columns.num))
-    place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
-    if columns.frame >= 0:
-        arms_m = mean(antenna_positions(problem, placed) - placed.translation)
-        place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
-    return Linearized(
-        residual_m=mean(on_map.residual_m) + shift_m,
-        design=mean(range_jacobian(problem, columns, state, state)),
-        prior_residual=prior_residuals(problem, columns, state),
-        prior_design=prior_jacobian(problem, columns, state, state),
-        columns=columns,
-        place=place,
-        bins=bins,
-        time_s=mean(on_map.time_s),
-        gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
-        by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
-        by_time=by_time,
-        on_map=on_map,
-        scatter_m=scatter_m,
-        shift_m=shift_m,
-        components=components,
-        errors=errors,
-    )
-
-
-def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
-    """Return the (n, 6 k) derivatives of the distances by the path's k poses."""
-    gradient, placed = RangeGradient.of(on_map.from_anchor_m), on_map.state.metric_from_model
-    return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
-
-
-def _wandering_m2(bins_of_ranges: RangeBins) -> Array:
-    index, time_s = bins_of_ranges.anchor_index, bins_of_ranges.time_s
-    together = np.exp(-np.abs(time_s[:, None] - time_s) / DRIFT_S)
-    return np.asarray(_WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together)
-
-
-def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:
-    index = on_map.problem.anchor_index
-    order = np.lexsort((on_map.time_s, on_map.tag_index, index))
-    off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
-    agrees = np.empty(len(order), dtype=bool)
-    agrees[order] = _agree(np.abs(off_m) <= near_m(scatter_m), index[order])
-    of_ranges = range_bins(
-        index,
-        on_map.tag_index,
-        on_map.time_s,
-        on_map.from_anchor_m,
-        np.swapaxes(on_map.world_from_cam, 1, 2),
-        (agrees & _can_be(on_map)).astype(np.float64),
-        noisiness(index[order], off_m, on_map.problem.num_anchors),
-        _MAX_NUM_BINS,
-    )
-    return of_ranges, scatter_m
+def _wandering_m2(bins: RangeBins) -> Array:
+    together = np.exp(-np.abs(bins.time_s[:, None] - bins.time_s) / DRIFT_S)
+    return np.asarray(_WANDERING_M**2 * (1.0 + (bins.anchor_index[:, None] == bins.anchor_index)) * together)
 
 
 def _can_be(on_map: RangesOnMap) -> Mask:

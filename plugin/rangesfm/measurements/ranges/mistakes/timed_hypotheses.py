@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Mask
 from rangesfm.measurements.ranges.mistakes.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
 from rangesfm.measurements.ranges.mistakes.hypothesis import (
     Correction,
@@ -63,8 +63,8 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield for each anchor: it was moved at some time."""
     for k in problem.heard:
         # The anchor must be within reach before and after.
-        most_m = 2 * longest_m(problem, k)
-        yield from _elsewhere(problem, k, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
+        most_m, name = 2 * longest_m(problem, [k]), problem.on_map.anchor_ids[k]
+        yield from _elsewhere(problem, [k], name, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
 
 
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
@@ -72,33 +72,35 @@ def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     # Two parts of a map cannot be farther apart than the map is large.
     tags_m = antenna_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
     extent_m = float(np.linalg.norm(np.ptp(tags_m, axis=0)))
-    return _elsewhere(problem, None, "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
+    return _elsewhere(problem, _all(problem), "", "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: after some time the tag is elsewhere on the camera."""
+    on_map = problem.on_map
     # The tag is still on the camera.
-    most_m = to_other_side_m(lever_arm_m(problem))
-    return _elsewhere(problem, None, "tag slipped", most_m, lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
+    most_m = max(to_other_side_m(lever_arm_m(problem, tag)) for tag in np.unique(on_map.tag_index).tolist())
+    axes, by_shift = (lambda: on_map.world_from_cam), problem.by_lever_arm
+    return _elsewhere(problem, _all(problem), "", "tag slipped", most_m, axes, by_shift)
 
 
 def _elsewhere(
     problem: Linearized,
-    anchor: int | None,
+    anchors: Sequence[int],
+    whose: str,
     name: str,
     most_m: float,
     axes: Callable[[], Array],
     by_shift: Array,
 ) -> Iterator[Hypothesis]:
-    """Yield moves at unknown times, relative to one anchor or to all.
+    """Yield moves at unknown times, relative to some anchors.
 
     Args:
-        name: kind of the move, a key of ``_MOVES``. most_m: largest possible move.
+        whose: the anchor's id, or nothing. name: kind of the move, a key of ``_MOVES``. most_m: largest possible move.
         axes: axes of the move, (3, 3), or (n, 3, 3) for each range.
         by_shift: (c, 3) derivatives of the predicted ranges along these axes.
     """
     words, remedy, max_unnoticed = _MOVES[name]
-    whose = _name(problem, anchor)
 
     def back(later: Callable[[], Mask], size: Array) -> Correction:
         from_anchor_m = problem.on_map.from_anchor_m
@@ -118,18 +120,16 @@ def _elsewhere(
             max_unnoticed=max_unnoticed,
         )
 
-    return _changes(problem, anchor, 3 * _MIN_NUM_BINS, moved)
+    return _changes(problem, anchors, 3 * _MIN_NUM_BINS, moved)
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: after some time the ranges of one anchor, or of all, read longer or shorter."""
-    for k in _each_and_all(problem):
-        yield from _steps(problem, k)
+    for name, anchors in _each_and_all(problem):
+        yield from _steps(problem, name, anchors)
 
 
-def _steps(problem: Linearized, anchor: int | None) -> Iterator[Hypothesis]:
-    name = _name(problem, anchor)
-
+def _steps(problem: Linearized, name: str, anchors: Sequence[int]) -> Iterator[Hypothesis]:
     def words(when: str, size: Array) -> str:
         to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
         return f"the ranges{to} jumped {when}: since then they read about {abs(size[0]):.2f} m {how}"
@@ -142,11 +142,11 @@ def _steps(problem: Linearized, anchor: int | None) -> Iterator[Hypothesis]:
             words=partial(words, when),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
             correction=longer(later),
-            most=longest_m(problem, anchor),
+            most=longest_m(problem, anchors),
             is_linear=True,
         )
 
-    return _changes(problem, anchor, _MIN_NUM_BINS, step)
+    return _changes(problem, anchors, _MIN_NUM_BINS, step)
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
@@ -156,13 +156,13 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     def words(name: str, when: str, size: Array) -> str:
         return f"the ranges{f' to anchor {name}' if name else ''} {too_long(size)} {when}"
 
-    for k in _each_and_all(problem):
-        name = _name(problem, k)
+    for name, anchors in _each_and_all(problem):
+        is_of = np.isin(problem.bins.anchor_index, anchors)
         for start, end, share in windows:
-            inside = np.where(_is_of(problem.bins.anchor_index, k), share, 0.0)
+            inside = np.where(is_of, share, 0.0)
             if inside.sum() < _MIN_NUM_BINS:
                 continue
-            within = partial(_later, problem, k, start, end)
+            within = partial(_later, problem, anchors, start, end)
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
                 of_bins(problem, -inside),
@@ -170,7 +170,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
                 words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
                 correction=longer(within),
-                most=longest_m(problem, k),
+                most=longest_m(problem, anchors),
                 adoption=partial(_left_out, within),
                 is_linear=True,
             )
@@ -178,9 +178,9 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
 
 def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the clocks' offset jumped at some time."""
-    by_time = problem.by_time
-    if by_time is None:
+    if problem.on_map.velocity is None:
         return iter(())
+    by_time = problem.bins.mean(problem.on_map.by_time)
 
     def jump(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
         return Hypothesis(
@@ -194,60 +194,56 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
             is_linear=True,
         )
 
-    return _changes(problem, None, _MIN_NUM_BINS, jump)
+    return _changes(problem, _all(problem), _MIN_NUM_BINS, jump)
 
 
-def _name(problem: Linearized, anchor: int | None) -> str:
-    return "" if anchor is None else problem.on_map.anchor_ids[anchor]
+def _all(problem: Linearized) -> list[int]:
+    return list(range(len(problem.on_map.anchor_ids)))
 
 
-def _each_and_all(problem: Linearized) -> list[int | None]:
-    """Return the anchors, if there are several, and None for all together."""
-    return [*(problem.heard if len(problem.heard) > 1 else []), None]
+def _each_and_all(problem: Linearized) -> Iterator[tuple[str, list[int]]]:
+    """Yield the anchors, by name, if there are several, and all together, without a name."""
+    for k in problem.heard if len(problem.heard) > 1 else ():
+        yield problem.on_map.anchor_ids[k], [k]
+    yield "", _all(problem)
 
 
-def _later(problem: Linearized, anchor: int | None, start: float, end: float = np.inf) -> Mask:
-    """Return an (n,) mask of the ranges to one anchor, or to all, between two times."""
+def _later(problem: Linearized, anchors: Sequence[int], start: float, end: float = np.inf) -> Mask:
+    """Return an (n,) mask of the ranges to some anchors between two times."""
     on_map = problem.on_map
-    return _is_of(on_map.problem.anchor_index, anchor) & (on_map.time_s > start) & (on_map.time_s <= end)
+    return np.isin(on_map.problem.anchor_index, anchors) & (on_map.time_s > start) & (on_map.time_s <= end)
 
 
 def _left_out(rows: Callable[[], Mask], _: Array) -> Correction:
-    return Correction(left_out=rows())
-
-
-def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
-    """Return a mask of the ranges of one anchor, or of all if None."""
-    return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
+    return Correction(left_out=np.flatnonzero(rows()))
 
 
 def _changes(
     problem: Linearized,
-    anchor: int | None,
+    anchors: Sequence[int],
     least: int,
     change: Callable[[str, Callable[[], Mask], Array], Hypothesis],
-    around: float | None = None,
 ) -> Iterator[Hypothesis]:
-    """Yield a change of one anchor, or of all, at times away from the ends of the survey.
+    """Yield a change of some anchors at times away from the ends of the survey.
 
     Args:
         least: fewest bins before and after.
         change: returns the hypothesis, given words for its time, a function that returns the later ranges, and (c,)
             shares of the bins that are later.
-        around: try only times near this one, more closely spaced.
     """
-    ends = _LEAST_SHARE, 1 - _LEAST_SHARE
-    of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
-    times = np.unique(np.quantile(problem.on_map.time_s[of_ranges], np.linspace(*ends, _NUM_TIMES)))
-    if around is not None:
-        at = int(np.searchsorted(times, around))
-        times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
-    is_of = _is_of(problem.bins.anchor_index, anchor)
-    for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
-        after = np.where(is_of, share, 0.0)
-        if min(after.sum(), is_of.sum() - after.sum()) >= least:
-            made = change(_when(problem, time), partial(_later, problem, anchor, time), after)
-            yield replace(made, refine_time=partial(_changes, problem, anchor, least, change, time))
+    of_anchors = np.isin(problem.on_map.problem.anchor_index, anchors)
+    is_of = np.isin(problem.bins.anchor_index, anchors)
+    shares = np.linspace(_LEAST_SHARE, 1 - _LEAST_SHARE, _NUM_TIMES)
+
+    def at(times: Array) -> Iterator[Hypothesis]:
+        for k, (time, share) in enumerate(zip(times.tolist(), _shares_after(problem, times), strict=True)):
+            after = np.where(is_of, share, 0.0)
+            if min(after.sum(), is_of.sum() - after.sum()) >= least:
+                finer = np.linspace(times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)], _NUM_FINER)
+                made = change(_when(problem, time), partial(_later, problem, anchors, time), after)
+                yield replace(made, refine_time=partial(at, finer))
+
+    return at(np.unique(np.quantile(problem.on_map.time_s[of_anchors], shares)))
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
@@ -269,12 +265,11 @@ def _shares_after(problem: Linearized, times: Array) -> Array:
     return later
 
 
-def _when(problem: Linearized, start: float, end: float | None = None) -> str:
+def _when(problem: Linearized, start: float, end: float = np.inf) -> str:
     begin = problem.on_map.time_s.min()
-    what = "m along the path" if problem.by_time is None else "s after the first range"
-    return (
-        f"{'' if end is None else 'from '}{start - begin:.0f}{'' if end is None else f' to {end - begin:.0f}'} {what}"
-    )
+    what = "m along the path" if problem.on_map.velocity is None else "s after the first range"
+    span = f"from {start - begin:.0f} to {end - begin:.0f}" if np.isfinite(end) else f"{start - begin:.0f}"
+    return f"{span} {what}"
 
 
 SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (

@@ -14,10 +14,9 @@ from rangesfm.measurements.joint_map import BentMap, Doubt, JointMap, KindOnMap,
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
-from rangesfm.measurements.ranges.mistakes.anchor_sides import AnchorSides, likelier_sides
-from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges, drifts
+from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m, bent_to_ranges, drifts, likelier_sides
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
-from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, linearized, ranges_on_map
+from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
 from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
@@ -29,6 +28,7 @@ from rangesfm.measurements.ranges.scale.doubts import (
 )
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, predicted_ranges, solve
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.sensitivity import scale_sensitivity
 from rangesfm.measurements.ranges.scale.solution import Solution, with_unknown_anchors
