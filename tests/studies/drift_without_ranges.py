@@ -53,6 +53,7 @@ from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.position_scale import PositionScale
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
@@ -101,7 +102,8 @@ class Drifting:
         covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
         names = self.survey.trajectory.image_names if of_photos else None
         log = PositionLog(at_m, covariances, None if of_photos else times, names, np.arange(len(times)))
-        return SurveyedPositions(None, AntennaTrack(log, TAG_IN_CAM_M, None if of_photos else 0.0, RangesOptions()))
+        offset = None if of_photos else TimeOffset.given(0.0)
+        return SurveyedPositions(antenna=AntennaTrack(log, TAG_IN_CAM_M, offset, RangesOptions()))
 
     def marks(self, num: int) -> tuple[dict[str, Marker], dict[str, Array]]:
         """Return marks and their true positions, evenly along the path."""

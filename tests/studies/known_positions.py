@@ -49,6 +49,7 @@ from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.metric_result import MetricResult
@@ -142,7 +143,7 @@ def clock_off(surveyed: SurveyedPositions, ahead_s: float = 1.0) -> SurveyedPosi
     assert surveyed.antenna is not None
     assert surveyed.antenna.log.timestamp_s is not None
     log = replace(surveyed.antenna.log, timestamp_s=surveyed.antenna.log.timestamp_s + ahead_s)
-    return replace(surveyed, antenna=replace(surveyed.antenna, log=log, offset_s=0.0))
+    return replace(surveyed, antenna=replace(surveyed.antenna, log=log, offset=TimeOffset.given(0.0)))
 
 
 def leap_off(surveyed: SurveyedPositions) -> SurveyedPositions:
@@ -152,7 +153,6 @@ def leap_off(surveyed: SurveyedPositions) -> SurveyedPositions:
 
 def one_point_off(surveyed: SurveyedPositions) -> SurveyedPositions:
     """Return the positions with one control point half a metre off."""
-    assert surveyed.points is not None
     first, *others = surveyed.points.points
     wrong = replace(first, position_m=first.position_m + np.array([0.3, 0.4, 0.0]))
     return replace(surveyed, points=replace(surveyed.points, points=(wrong, *others)))
@@ -205,9 +205,8 @@ class Known:
         truth = self.truth.model
         path = trajectory_from_reconstruction(truth.reconstruction, truth.timestamps_s)
         antenna = self.surveyed.antenna
-        known_offset = antenna and replace(antenna, offset_s=None if antenna.log.timestamp_s is None else 0.0)
+        known_offset = antenna and replace(antenna, offset=TimeOffset.given(0.0))
         known = replace(self.surveyed, antenna=known_offset).located(truth.reconstruction, path)
-        assert known is not None
         photos_problem = photos_adjuster(self.truth, truth.reconstruction).problem
         photos = PhotosAlone(
             NormalEquations.of(photos_problem, truth.reconstruction, photos_problem.num_residuals()), pixel_stddev

@@ -24,8 +24,7 @@ from tests.studies.known_positions import NO_RANGES
 from tests.studies.real_room import interpolated, path_and_truth
 
 from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.positions.antenna_places import locate_antenna
-from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.position_scale import scale_by_positions

@@ -54,7 +54,7 @@ class Placed:
 
 @with_one_blas_thread
 def diagnose_points(
-    points: ControlPoints | None,
+    points: ControlPoints,
     model: pycolmap.Reconstruction,
     errors: MapErrors | None,
     scale_stddev: float,
@@ -71,13 +71,11 @@ def diagnose_points(
         errors: of the refined map; None if it is not refined, or has none: those of ``placed``.
         scale_stddev: as for ``MapErrors.joint``.
     """
-    if points is None:
-        return MistakeTests()
     is_seen = marks_seen(points, model)
     tested = [of for of, seen in zip(points.points, is_seen, strict=True) if seen and of.kind in (CONTROL, CHECK)]
     if not tested:
         return MistakeTests()
-    finder = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path)
+    finder = MapPoints(model, {}, points.markers, np.nan)
     found = [finder.find_marker(of.name) for of in tested]
     of_map = placed.joint(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
     if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 
@@ -20,7 +20,7 @@ from rangesfm.measurements.kind import Measurements
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
 from rangesfm.solver.posterior import (
     MAX_NUM_OBSERVATIONS,
@@ -380,6 +380,24 @@ def tested_kinds(
     return tuple(
         each.tested(placed, [other for other in found if other.kind != each.kind], is_last=is_last) for each in kinds
     )
+
+
+def most_contradicting(
+    rows: Indices, statistic: Callable[[int], float], statistic_without: Callable[[int], float]
+) -> tuple[int, float]:
+    """Return the measurement that contradicts the others most, and its statistic against them.
+
+    Errors are learnt again without each suspect, as its own error would be taken for theirs.
+
+    Args:
+        rows: of the measurements, at least one. statistic: of one, with the errors as they are.
+        statistic_without: the same with errors that are learnt from the others.
+    """
+    suspicious = np.array([statistic(row) for row in rows.tolist()])
+    suspects = rows[np.argsort(-suspicious, kind="stable")[:NUM_SUSPECTS]]
+    found = {row: statistic_without(row) for row in suspects.tolist()}
+    worst = max(found, key=found.__getitem__)
+    return worst, found[worst]
 
 
 def beside_others(located: Sequence[Located], others: Sequence[KindOnMap]) -> tuple[KindOnMap, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -15,19 +14,14 @@ from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 
 
-def add_marks(
-    model: pycolmap.Reconstruction, markers: Mapping[str, Marker], path: Path | None = None
-) -> dict[str, int]:
+def add_marks(model: pycolmap.Reconstruction, markers: Mapping[str, Marker]) -> dict[str, int]:
     """Add markers to the model as 3-D points, with their marks as features; return the points' ids by name.
-
-    Args:
-        path: file of the markers, for messages.
 
     Raises:
         InputError: as in ``locate_distances``.
     """
     images = images_by_name(model)
-    places = {name: triangulate_marker(name, marker, images, path) for name, marker in markers.items()}
+    places = {name: triangulate_marker(name, marker, images) for name, marker in markers.items()}
     ids = {}
     for name, place in places.items():
         marker = markers[name]

@@ -37,14 +37,14 @@ def by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Riv
         return run.estimate_scale(replace(path, observations=observations))
 
     def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
-        antenna = track and replace(track, offset_s=other.value_s)
+        antenna = track and replace(track, offset=other)
         positions = replace(run.inputs.positions, antenna=antenna)
         return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path)
 
     found = list[Rivals]()
     if offset is not None and offset.rivals:
         found.append(scale_by_rivals(estimate, trajectory, offset, at_ranges_offset, "", REMEDY))
-    if track is not None and (search := track.search) is not None and search.rivals:
+    if track is not None and (search := track.offset) is not None and search.rivals:
         remedy = POSITIONS.remedy
         found.append(scale_by_rivals(estimate, trajectory, search, at_positions_offset, " of the positions", remedy))
     return Rivals(sum((each.doubts for each in found), ()), math.hypot(*(each.stddev for each in found)))

@@ -228,8 +228,9 @@ def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
         journal.warn(message)
     journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
     sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    tape, positions = inputs.tape.with_more(sides, found.markers), inputs.positions
-    return replace(run, inputs=replace(inputs, tape=tape, positions=positions.with_more_markers(found.markers)))
+    tape = inputs.tape.with_more(sides).with_more_markers(found.markers)
+    positions = inputs.positions.with_more_markers(found.markers)
+    return replace(run, inputs=replace(inputs, tape=tape, positions=positions))
 
 
 def map_keyframes(

@@ -121,7 +121,7 @@ def _points_of(result: ResultFolder, markers_path: Path | None) -> MapPoints:
     markers = _markers_of(result) | ({} if markers_path is None else read_markers(markers_path))
     markers = markers_of_photos(markers, [image.name for image in model.images.values()])
     anchors_m = result.anchor_positions_m
-    return MapPoints(model, anchors_m, markers, np.nan if pixel_stddev is None else pixel_stddev, markers_path)
+    return MapPoints(model, anchors_m, markers, np.nan if pixel_stddev is None else pixel_stddev)
 
 
 def _markers_of(result: ResultFolder) -> dict[str, Marker]:

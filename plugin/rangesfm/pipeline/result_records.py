@@ -197,7 +197,7 @@ def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
 def points_entry(found: MetricResult) -> entries.PointsEntry | None:
     """Return control and check points in the final map; None without any, or where the map is not in the site."""
     known = found.positions.points
-    if known is None or found.estimate.frame != "site":
+    if not known.points or found.estimate.frame != "site":
         return None
     located = locate_points(known, found.final, found.trajectory.as_in(found.final))
     places = dict(zip(located.names, located.predicted_m(IDENTITY), strict=True))

@@ -188,7 +188,7 @@ def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:
     try:
         return replace(positions, antenna=find_antenna_offset(positions.antenna, path.trajectory))
     except GeometryError as error:
-        if not len(run.inputs.log) and positions.points is None:
+        if not len(run.inputs.log) and not positions.points.points:
             raise
         run.journal.warn(f"the positions of the antenna are not used: {error}")
         return replace(positions, antenna=None)

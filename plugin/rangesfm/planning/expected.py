@@ -266,7 +266,7 @@ def _positions(
 ) -> tuple[Observations | None, PlacementPrior | None, tuple[str, ...]]:
     """Return the known positions, what they say of the map's place without ranges, and why they are not used."""
     known, notes = planned.known_positions()
-    if known is None:
+    if not len(known):
         return None, None, notes
     try:
         found = planned_positions(known, planned.trajectory, planned.lasting_s, max_num)

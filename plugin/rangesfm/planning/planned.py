@@ -12,10 +12,9 @@ from pydantic import Field
 from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
-from rangesfm.measurements.positions.antenna_places import locate_antenna
-from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.control_points import ControlPoint
-from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions, joined_positions
+from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
@@ -61,7 +60,7 @@ class PlannedAntenna(Options, table="positions"):
         covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
         nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
         log = PositionLog(nowhere, covariance_m2, times_s, None, lines)
-        found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, RangesOptions()), path)
+        found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), None, RangesOptions()), path)
         return replace(found, position_m=found.predicted_m(IDENTITY))
 
 
@@ -191,18 +190,17 @@ class PlannedSurvey:
         """Times for which errors of the antenna's positions last, seconds."""
         return LASTING_S if self.antenna is None or self.antenna.lasting_s is None else (self.antenna.lasting_s,)
 
-    def known_positions(self) -> tuple[KnownPositions | None, tuple[str, ...]]:
+    def known_positions(self) -> tuple[KnownPositions, tuple[str, ...]]:
         """Return the known positions without errors, as a run finds them in the map, and what it will leave out."""
-        marks, notes = None, tuple[str, ...]()
-        if self.points:
-            marks = (self.photos or PlannedPhotos()).marks_of(self.trajectory, self.points)
-            if unseen := [point.name for point in self.points if point.name not in marks.names]:
-                notes = (
-                    f"{len(unseen)} of {len(self.points)} points are left out, as no two photos of the path show them "
-                    f"from different directions ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
-                )
-        track = None if self.antenna is None else self.antenna.located(self.trajectory)
-        return joined_positions([marks, track]), notes
+        known, notes = (self.photos or PlannedPhotos()).marks_of(self.trajectory, self.points), tuple[str, ...]()
+        if unseen := [point.name for point in self.points if point.name not in known.names]:
+            notes = (
+                f"{len(unseen)} of {len(self.points)} points are left out, as no two photos of the path show them "
+                f"from different directions ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
+            )
+        if self.antenna is not None:
+            known = known.joined(self.antenna.located(self.trajectory))
+        return known, notes
 
     @property
     def taped_lengths(self) -> LocatedDistances:

@@ -205,7 +205,7 @@ class PlannedPhotos(Options, table="photos"):
 
 def _is_found(name: str, marker: Marker, model: pycolmap.Reconstruction) -> bool:
     try:
-        triangulate_marker(name, marker, images_by_name(model), None)
+        triangulate_marker(name, marker, images_by_name(model))
     except InputError:
         return False
     return True

@@ -17,12 +17,13 @@ from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.known_positions import LASTING_S
 from rangesfm.measurements.positions.position_formats import read_positions
-from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchor_list
 from rangesfm.measurements.ranges.anchors.anchor_ids import ids_in_log
 from rangesfm.measurements.ranges.anchors.site import Site, local_site, site_of
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
@@ -82,10 +83,8 @@ class RangingInputs:
     def listed_photos(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield the photos that each file names, after what it says of them."""
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
-        if points is not None:
-            yield f"marks in {_name(points.markers_path or points.path)}", _photos_of(points.markers)
-        elif tape.markers:
-            yield f"marks in {_name(tape.markers_path)}", _photos_of(tape.markers)
+        for markers in filter(None, [points.markers or tape.markers]):
+            yield f"marks in {_name(next(iter(markers.values())).path)}", _photos_of(markers)
         if antenna is not None and antenna.log.image_name is not None:
             yield f"positions in {_name(antenna.log.path)}", antenna.log.image_name
         if self.log.image_name is not None:
@@ -94,8 +93,7 @@ class RangingInputs:
     def with_photos(self, photos: Collection[str]) -> RangingInputs:
         """Return the inputs with the photos of marks named as these are."""
         points, tape = self.positions.points, self.tape
-        if points is not None:
-            points = replace(points, markers=markers_of_photos(points.markers, photos))
+        points = replace(points, markers=markers_of_photos(points.markers, photos))
         tape = replace(tape, markers=markers_of_photos(tape.markers, photos))
         return replace(self, tape=tape, positions=replace(self.positions, points=points))
 
@@ -190,10 +188,10 @@ def _surveyed_positions(
     points, asked = read_control_points(survey.points, survey.scale.markers), survey.positions
     folder = asked.path if asked.path is not None and asked.path.is_dir() else None
     log = read_positions(asked) if folder is None else read_exif_positions(folder)
-    if points is None and log is None:
-        return site, SurveyedPositions()
+    if not points.points and log is None:
+        return site, NO_POSITIONS
     if frame == "first_camera":
-        table, path = ("points", survey.points.path) if points is not None else ("positions", asked.path)
+        table, path = ("points", survey.points.path) if points.points else ("positions", asked.path)
         raise InputError(f"[{table}] are in the site, expected [anchors] frame to be site as well", path)
     is_placed = frame == "site" and any(anchor.position_m is not None for anchor in anchors)
 
@@ -204,7 +202,7 @@ def _surveyed_positions(
         is_placed, (site, moved) = True, site_of(coordinates, crs, path)
         return moved
 
-    if points is not None:
+    if points.points:
         points = points.moved_to(local(points.positions_m, survey.points.crs or points.crs, points.path))
     if log is None:
         return site, SurveyedPositions(points)
@@ -212,7 +210,8 @@ def _surveyed_positions(
         log = replace(log, covariance_m2=np.tile(asked.stddev_m**2 * np.eye(3), (len(log), 1, 1)))
     log = replace(log, crs=asked.crs or log.crs)
     log = log.moved_to(local(log.position_m, log.crs, log.path))
-    antenna = AntennaTrack(log, np.array(asked.antenna_in_cam_m), asked.time_offset_s, survey.ranges)
+    offset = None if asked.time_offset_s is None else TimeOffset.given(asked.time_offset_s)
+    antenna = AntennaTrack(log, np.array(asked.antenna_in_cam_m), offset, survey.ranges)
     return site, SurveyedPositions(points, antenna, (asked.lasting_s,) if asked.lasting_s else LASTING_S)
 
 

@@ -84,17 +84,10 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     surveyed = _with_antenna_at(inputs.positions, {} if at.rest is None else at.rest.state.blocks)
     known = surveyed.located(at.model, at.path)
-    if known is None or known.is_check.all():
+    if known.is_check.all():
         return None
-    found = scale_by_positions(
-        known,
-        at.path,
-        at.bending,
-        is_at_rest=bool(at.before),
-        lasting_s=surveyed.lasting_s,
-        metres_per_unit=at.metres_per_unit,
-    )
-    return replace(found, surveyed=surveyed)
+    is_at_rest, unit = bool(at.before), at.metres_per_unit
+    return scale_by_positions(known, at.path, at.bending, surveyed, is_at_rest=is_at_rest, metres_per_unit=unit)
 
 
 def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array]) -> SurveyedPositions:
@@ -102,8 +95,8 @@ def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array])
     track = surveyed.antenna
     if track is None or ARM not in blocks:
         return surveyed
-    offset_s = None if track.offset_s is None else track.offset_s + float(blocks[CLOCK][0])
-    return replace(surveyed, antenna=replace(track, offset_s=offset_s, antenna_in_cam_m=blocks[ARM]))
+    offset = track.offset and replace(track.offset, value_s=track.offset_s + float(blocks[CLOCK][0]))
+    return replace(surveyed, antenna=replace(track, offset=offset, antenna_in_cam_m=blocks[ARM]))
 
 
 def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:

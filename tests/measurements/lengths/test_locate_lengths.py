@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,9 @@ def marker_of(model: pycolmap.Reconstruction, point: pycolmap.Point3D) -> Marker
 
 
 def tape(*distances: TapedDistance, **markers: Marker) -> Tape:
-    return Tape(distances, markers, Path("d.csv"), Path("m.csv"))
+    return Tape(
+        distances, {name: replace(marker, path=Path("m.csv")) for name, marker in markers.items()}, Path("d.csv")
+    )
 
 
 def test_two_photos_are_as_far_apart_as_their_cameras(made: SyntheticModel) -> None:

@@ -14,6 +14,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -58,7 +59,8 @@ def track(places: Places, times_s: Array, num_wrong: int = 0, offset_s: float | 
     at_m = places(times_s) + [1012.0, 5003.0, 413.0] + NOISE_M * rng.standard_normal((len(times_s), 3))
     at_m[rng.permutation(len(at_m))[:num_wrong]] += rng.normal(0.0, 20.0, (num_wrong, 3))
     log = PositionLog(at_m, np.full((len(at_m), 3, 3), np.nan), times_s + AHEAD_S, None, np.arange(len(at_m)))
-    return AntennaTrack(log, np.zeros(3), offset_s, RangesOptions())
+    offset = None if offset_s is None else TimeOffset.given(offset_s)
+    return AntennaTrack(log, np.zeros(3), offset, RangesOptions())
 
 
 def photos(places: Places, times_s: Array = PHOTOS_S) -> Trajectory:
@@ -72,7 +74,7 @@ def photos(places: Places, times_s: Array = PHOTOS_S) -> Trajectory:
 def test_the_offset_of_a_walk_is_found_by_all_or_some_of_its_time_and_in_spite_of_outliers(
     end_s: float, num_wrong: int
 ) -> None:
-    search = find_antenna_offset(track(walk, np.arange(0.0, end_s, 0.2), num_wrong), photos(walk)).search
+    search = find_antenna_offset(track(walk, np.arange(0.0, end_s, 0.2), num_wrong), photos(walk)).offset
     assert search is not None
     assert abs(search.value_s + AHEAD_S) < min(3 * search.stddev_s, 0.1)
     assert search.is_certain
@@ -86,7 +88,7 @@ def test_the_offset_on_a_path_that_repeats_itself_is_refused_or_told_with_its_ri
 ) -> None:
     search = None
     with contextlib.suppress(GeometryError):
-        search = find_antenna_offset(track(places, np.arange(start_s, end_s, 0.2)), photos(places)).search
+        search = find_antenna_offset(track(places, np.arange(start_s, end_s, 0.2)), photos(places)).offset
     if search is None:
         return
     offsets_s = [search.value_s, *(rival.value_s for rival in search.rivals)]
@@ -101,7 +103,7 @@ def laps(times_s: Array) -> Array:
 
 
 def test_an_offset_that_explains_all_positions_is_likelier_than_those_that_explain_half_of_them() -> None:
-    search = find_antenna_offset(track(laps, np.arange(0.0, 40.0, 0.2)), photos(laps, PHOTOS_S[:80])).search
+    search = find_antenna_offset(track(laps, np.arange(0.0, 40.0, 0.2)), photos(laps, PHOTOS_S[:80])).offset
     assert search is not None
     assert search.value_s == pytest.approx(-AHEAD_S, abs=0.05)
     assert all(search.probability > 10 * rival.probability for rival in search.rivals)

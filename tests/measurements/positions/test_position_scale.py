@@ -16,7 +16,6 @@ from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_scale import (
     _determine,
     _doubts_of_axes,
-    _Search,
     refuse_open_turn,
     scale_by_positions,
 )
@@ -47,10 +46,6 @@ def survey(is_mark: list[bool], noise_m: float = 0.0, stddev_m: float = 0.1, see
     )
 
 
-def search(positions: KnownPositions) -> _Search:
-    return _Search(positions, path(), False, (), 1.0)
-
-
 def finite_differences(positions: KnownPositions) -> Array:
     """(3 k, 7) changes of the positions by a step from the true similarity, per unit of each number."""
     steps = 1e-6 * np.eye(7)
@@ -78,8 +73,7 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    searched = search(wrong)
-    fit = searched.fit(used, searched.start(used))
+    fit = scale_by_positions(replace(wrong, is_check=~used), path(), WalkBending(path())).fit
     assert_same(fit.similarity, SITE_FROM_MODEL)
     np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(fit.stddev_m, 0.1)
@@ -100,10 +94,8 @@ def test_three_positions_off_a_line_determine_a_similarity() -> None:
 def test_too_few_positions_are_refused_with_their_number() -> None:
     positions = replace(survey([True] * 4), is_check=np.array([False, True, True, False]))
     with pytest.raises(GeometryError, match=r"^2 known positions are in the map, expected 3 or more that are not on"):
-        search(positions).require_enough()
-    search(replace(positions, is_check=np.arange(4) == 1)).require_enough()
-    with pytest.raises(GeometryError, match="2 known positions are in the map"):
         scale_by_positions(positions, path(), WalkBending(path()))
+    scale_by_positions(replace(positions, is_check=np.arange(4) == 1), path(), WalkBending(path()))
 
 
 @pytest.mark.parametrize("row", [1, 2, 3])

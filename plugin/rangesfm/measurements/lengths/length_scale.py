@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, number_text
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.joint_map import (
+    Doubt,
+    JointMap,
+    KindOnMap,
+    fit_kinds,
+    in_first_cameras_frame,
+    most_contradicting,
+)
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS, lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests, finite
 from rangesfm.solver.posterior import (
     MAX_NUM_OBSERVATIONS,
@@ -196,20 +203,19 @@ class LengthScale(KindOnMap):
             columns[of.rows[LENGTHS].start + k] = 1.0
             return columns
 
-        def excess(kept: Mask, k: int) -> float:
-            without = problem(kept & (np.arange(num) != k))
-            return without.mistake(effect(without, k)).statistic / self.threshold if without.is_used.any() else 0.0
+        def among(of: JointProblem, k: int) -> float:
+            return of.mistake(effect(of, k)).statistic if of.is_used.any() else 0.0
+
+        def against(kept: Mask, k: int) -> float:
+            return among(problem(kept & (np.arange(num) != k)), k)
 
         kept = self.is_kept.copy() if is_last else np.ones(num, dtype=bool)
         while not is_last and kept.sum() + len(others) > 2 and (~kept).sum() + 1 < (num + len(others)) / 2:
-            now, among = problem(kept), np.flatnonzero(kept)
-            suspicious = np.array([now.mistake(effect(now, k)).statistic for k in among.tolist()])
-            far = among[np.argsort(-suspicious, kind="stable")[:NUM_SUSPECTS]]
-            found = {k: excess(kept, k) for k in far.tolist()}
-            worst = max(found, key=found.__getitem__)
+            now = problem(kept)
+            worst, statistic = most_contradicting(np.flatnonzero(kept), partial(among, now), partial(against, kept))
             # Where the others contradict each other, one of them is wrong.
-            wrong_size = (now.mistake(now.size_of(each.kind)).statistic / self.threshold for each in others)
-            if found[worst] <= max(1.0, *wrong_size, 0.0):
+            wrong_size = (now.mistake(now.size_of(each.kind)).statistic for each in others)
+            if statistic <= max(self.threshold, *wrong_size, 0.0):
                 break
             kept[worst] = False
         now = problem(kept)

@@ -149,7 +149,7 @@ def locate_distances(
     """
     images, markers = images_by_name(model), triangulate_markers(tape, model)
     points = {name: image.projection_center() for name, image in images.items()} | markers
-    finder = MapPoints(model, {}, tape.markers, np.nan, tape.markers_path)
+    finder = MapPoints(model, {}, tape.markers, np.nan)
     slopes = np.zeros((len(tape.distances), 0 if path is None else 6 * len(path)))
     ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
     pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
@@ -202,7 +202,7 @@ def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str],
             marker = tape.markers[end]
             if (num := len({*marker.image_names} & {*photos})) < 2:
                 message = f"marker {end!r} is marked in {num} photos of the survey, expected two or more"
-                raise InputError(message, tape.markers_path, marker.lines[0])
+                raise InputError(message, marker.path, marker.lines[0])
 
 
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:

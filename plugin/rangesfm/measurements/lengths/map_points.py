@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -54,14 +53,12 @@ class MapPoints:
         anchors_m: (3,) positions of anchors by id, in the world of the model.
         markers: marks in photos by name.
         pixel_stddev: standard deviation of a coordinate of a feature; NaN if it is not known.
-        markers_path: file of the markers, for messages.
     """
 
     model: pycolmap.Reconstruction
     anchors_m: Mapping[str, Array]
     markers: Mapping[str, Marker]
     pixel_stddev: float
-    markers_path: Path | None = None
 
     def find(self, name: str) -> MapPoint:
         """Return the photo of that name (its projection centre), else the marker, the tag, the anchor or the point.
@@ -102,7 +99,7 @@ class MapPoints:
     def find_marker(self, name: str) -> MapPoint:
         """Return the marker of that name; errors as for ``triangulate_marker``."""
         marker = self.markers[name]
-        at = triangulate_marker(name, marker, self._images, self.markers_path)
+        at = triangulate_marker(name, marker, self._images)
         images = [self._images[photo] for photo in marker.image_names if photo in self._images]
         # Triangulation counts the distances from the rays, which grow with the depth for the same error in pixels.
         return MapPoint(name, at, _errors_of_seen(self.model, images, at, marker.stddev_px, by_distance=True))

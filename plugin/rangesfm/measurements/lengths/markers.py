@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -28,12 +27,10 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
     """Return the position (3,) of each marker that is an end of a length, by name; errors like ``locate_distances``."""
     images, wanted = images_by_name(model), tape.end_markers
-    return {name: triangulate_marker(name, marker, images, tape.markers_path) for name, marker in wanted.items()}
+    return {name: triangulate_marker(name, marker, images) for name, marker in wanted.items()}
 
 
-def triangulate_marker(
-    name: str, marker: Marker, images: Mapping[str, pycolmap.Image], markers_path: Path | None
-) -> Array:
+def triangulate_marker(name: str, marker: Marker, images: Mapping[str, pycolmap.Image]) -> Array:
     """Return the position of a marker (3,) in the model's world, from the photos that are in the model.
 
     It is the point that is nearest to the rays of the marks.
@@ -43,7 +40,7 @@ def triangulate_marker(
     """
 
     def wrong(what: str, k: int = 0) -> InputError:
-        return InputError(f"marker {name!r} {what}", markers_path, marker.lines[k])
+        return InputError(f"marker {name!r} {what}", marker.path, marker.lines[k])
 
     seen = [k for k, image_name in enumerate(marker.image_names) if image_name in images]
     if len(seen) < 2:
@@ -102,7 +99,7 @@ def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
     images, lost = images_by_name(model), set[str]()
     for name, marker in tape.found_markers.items():
         try:
-            triangulate_marker(name, marker, images, tape.markers_path)
+            triangulate_marker(name, marker, images)
         except InputError:
             lost.add(name)
     kept = (taped for taped in tape.distances if not (taped.is_printed and lost.intersection(taped.ends)))

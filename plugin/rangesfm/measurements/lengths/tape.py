@@ -52,12 +52,14 @@ class Marker:
         pixels: (k, 2) x and y in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
         lines: (k,) lines in the file; 0 if it was found.
         stddev_px: standard deviation of each coordinate.
+        path: the file, for messages; None without one.
     """
 
     image_names: tuple[str, ...]
     pixels: Array
     lines: tuple[int, ...]
     stddev_px: float = CLICKED_STDDEV_PX
+    path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,13 @@ class Tape:
     Attributes:
         distances: the lengths in the order of the file.
         markers: the markers by name.
-        distances_path, markers_path: the files they were read from, for messages.
+        distances_path: the file of the lengths, for messages.
         notes: lines for the user about how the lengths were read.
     """
 
     distances: tuple[TapedDistance, ...] = ()
     markers: Mapping[str, Marker] = field(default_factory=dict)
     distances_path: Path | None = None
-    markers_path: Path | None = None
     notes: tuple[str, ...] = ()
 
     def control(self) -> Tape:
@@ -92,9 +93,13 @@ class Tape:
         """Markers that were found in photos, not set by hand."""
         return {name: marker for name, marker in self.markers.items() if marker.stddev_px == FOUND_STDDEV_PX}
 
-    def with_more(self, distances: tuple[TapedDistance, ...], markers: Mapping[str, Marker] | None = None) -> Tape:
-        """Return the tape with more lengths and markers; its own markers are kept where a new one has an equal name."""
-        return replace(self, distances=self.distances + distances, markers={**(markers or {}), **self.markers})
+    def with_more(self, distances: tuple[TapedDistance, ...]) -> Tape:
+        """Return the tape with more lengths."""
+        return replace(self, distances=self.distances + distances)
+
+    def with_more_markers(self, markers: Mapping[str, Marker]) -> Tape:
+        """Return the tape with more markers; its own are kept where a new one has an equal name."""
+        return replace(self, markers={**markers, **self.markers})
 
     def without(self, rows: Collection[int]) -> Tape:
         """Return the tape with the lengths of these indices marked as left out."""

@@ -32,8 +32,7 @@ def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> T
     """
     listed = LENGTHS.read(Path(distances_path))
     markers = {} if markers_path is None else read_markers(markers_path)
-    of_markers = None if markers_path is None else Path(markers_path)
-    return Tape(_distances(listed), markers, Path(distances_path), of_markers, listed.notes)
+    return Tape(_distances(listed), markers, Path(distances_path), listed.notes)
 
 
 def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:
@@ -64,7 +63,7 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
         InputError: the file is not valid; the error gives the line.
     """
     if is_metashape_file(read_head(path)):
-        return markers_of_metashape(read_metashape_markers(Path(path)), stddev_px)
+        return markers_of_metashape(read_metashape_markers(Path(path)), Path(path), stddev_px)
     listed = MARKS.read(Path(path))
     names, image_names = listed.text("marker"), listed.text("image_name")
     pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
@@ -76,16 +75,17 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
         seen_in = tuple(image_names[row] for row in rows)
         if again := repeated(seen_in):
             raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
-        markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
+        lines = tuple(listed.table.line[rows].tolist())
+        markers[name] = Marker(seen_in, pixels[rows], lines, stddev_px, Path(path))
     return markers
 
 
-def markers_of_metashape(read: MetashapeMarkers, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
-    """Return the marks in photos of Metashape's markers."""
+def markers_of_metashape(read: MetashapeMarkers, path: Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
+    """Return the marks in photos of Metashape's markers, which were read from a file."""
     markers = {}
     for name, rows in read.seen.items():
         photos, pixels, lines = zip(*rows, strict=True)
-        markers[name] = Marker(photos, np.array(pixels), lines, stddev_px)
+        markers[name] = Marker(photos, np.array(pixels), lines, stddev_px, path)
     return markers
 
 

@@ -1,13 +1,23 @@
-"""An antenna's known positions, with what is known of its lever arm and of its clock."""
+"""An antenna's known positions, with its lever arm and its clock, and their places on the camera's path."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from rangesfm.arrays import Array
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import InputError
+from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.ranges.clock.offset import Rival, TimeOffset
+from rangesfm.measurements.ranges.association import is_too_long, places_on_path
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
+from rangesfm.util.files.clock_times import time_text
+from rangesfm.util.files.photo_names import rows_of_photos
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around
 
 
 @dataclass(frozen=True)
@@ -17,20 +27,119 @@ class AntennaTrack:
     Attributes:
         log: in the site's frame.
         antenna_in_cam_m: (3,) lever arm.
-        offset_s: image time minus time of the positions; None: not known yet. offset_stddev_s: its standard deviation.
+        offset: image time minus time of the positions; None: not known yet, or not needed.
         association: how positions are placed between keyframes.
         other_offset_s: offset with which the positions fit the path much better than with the given one; None: none.
-        search: how the offset was found, with other likely offsets; None where it was given or is not needed.
     """
 
     log: PositionLog
     antenna_in_cam_m: Array
-    offset_s: float | None
+    offset: TimeOffset | None
     association: RangesOptions
-    offset_stddev_s: float = 0.0
     other_offset_s: float | None = None
-    search: TimeOffset | None = None
 
-    def of_rival(self, rival: Rival) -> AntennaTrack:
-        """Return the track with another likely time offset."""
-        return replace(self, offset_s=rival.value_s, search=self.search and self.search.of_rival(rival))
+    @property
+    def offset_s(self) -> float:
+        """Image time minus time of the positions; 0 where it is not known."""
+        return 0.0 if self.offset is None else self.offset.value_s
+
+    @property
+    def offset_stddev_s(self) -> float:
+        """Standard deviation of the offset; 0 where it was given."""
+        return 0.0 if self.offset is None else self.offset.stddev_s
+
+
+def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
+    """Return the positions that have a place on a path; the others are left out."""
+    rows, before, after, fraction = _places(track, path)
+    k, times_s, velocity = len(rows), path.timestamps_s, np.zeros((len(rows), 3))
+    arms_m = np.tile(track.antenna_in_cam_m, (k, 1))
+    # The times of positions are those of a system's own epochs, so that they are exact.
+    on_path = places_on_path(path, arms_m, before, after, fraction, time_resolution_s=0.0, options=track.association)
+    if times_s is None or len(path) < 2:
+        at_s = before.astype(np.float64)
+    else:
+        velocity = _velocities(times_s, path.centers, before, after, fraction)
+        at_s = times_s[before] if track.log.timestamp_s is None else _times_s(track)[rows]
+    names = _names(track)
+    return KnownPositions(
+        names=tuple(names[row] for row in rows.tolist()),
+        is_mark=np.zeros(k, dtype=bool),
+        is_check=np.zeros(k, dtype=bool),
+        position_m=track.log.position_m[rows],
+        covariance_m2=track.log.covariance_m2[rows],
+        is_stated=np.asarray(np.isfinite(track.log.covariance_m2[rows]).all(axis=(1, 2))),
+        is_geodetic=np.full(k, track.log.crs is not None),
+        places=on_path.centers,
+        arms_m=on_path.arms_m,
+        own_covariance=on_path.stddev[:, None, None] ** 2 * np.eye(3),
+        arm_stddev_m=on_path.arm_stddev_m,
+        time_s=at_s,
+        clock_stddev_s=np.full(k, track.offset_stddev_s),
+        velocity=velocity,
+        world_from_cam=path.world_from_cam[np.where(fraction < 0.5, before, after)],
+        by_pose=_by_shifts(before, after, fraction, len(path)),
+        arms_by_pose=_by_turns(path, track.antenna_in_cam_m, before, after, fraction),
+        on_path=np.column_stack([before, after]),
+        fraction=fraction,
+        from_line=on_path.offsets,
+    )
+
+
+def _times_s(track: AntennaTrack) -> Array:
+    assert track.log.timestamp_s is not None, "positions by time"
+    return track.log.timestamp_s + track.offset_s
+
+
+def _names(track: AntennaTrack) -> list[str]:
+    if track.log.image_name is not None:
+        return [*track.log.image_name]
+    assert track.log.timestamp_s is not None, "positions by time"
+    return [time_text(time_s) for time_s in track.log.timestamp_s.tolist()]
+
+
+def _places(track: AntennaTrack, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
+    """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
+    log, options = track.log, track.association
+    if log.image_name is not None:
+        at = rows_of_photos(log.image_name, path.image_names)
+        rows = np.flatnonzero(at >= 0)
+        return rows, at[rows], at[rows], np.zeros(len(rows))
+    if path.timestamps_s is None:
+        raise InputError("the positions have times but the photos have none: give image times", log.path)
+    times, known = _times_s(track), path.timestamps_s
+    before, after, fraction, nearest = keyframes_around(times, known)
+    gap = known[after] - known[before]
+    is_between: Mask = (times >= known[0]) & (times <= known[-1]) & (gap > 0) & ~is_too_long(gap, options)
+    is_at = ~is_between & (np.abs(times - known[nearest]) <= options.max_time_difference_s)
+    before, after = np.where(is_at, nearest, before), np.where(is_at, nearest, after)
+    rows = np.flatnonzero(is_between | is_at)
+    return rows, before[rows], after[rows], np.where(is_at, 0.0, fraction)[rows]
+
+
+def _velocities(times_s: Array, centers: Array, before: Indices, after: Indices, fraction: Array) -> Array:
+    """Return (k, 3) velocities along the path, between those at the keyframes before and after."""
+    at_keyframes = np.gradient(centers, times_s, axis=0, edge_order=2 if len(times_s) > 2 else 1)
+    share = fraction[:, None]
+    return np.asarray((1 - share) * at_keyframes[before] + share * at_keyframes[after])
+
+
+def _by_shifts(before: Indices, after: Indices, fraction: Array, num: int) -> csr_array:
+    """Return the (3 k, 6 n) derivatives of the places by shifts of the poses."""
+    rows, axes = 3 * np.arange(len(before))[:, None] + np.arange(3), 3 + np.arange(3)
+    parts = [(1 - fraction, before), (fraction, after)]
+    values = np.concatenate([np.repeat(share, 3) for share, _ in parts])
+    columns = np.concatenate([(6 * pose[:, None] + axes).ravel() for _, pose in parts])
+    return coo_array((values, (np.tile(rows.ravel(), 2), columns)), shape=(3 * len(before), 6 * num)).tocsr()
+
+
+def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, fraction: Array) -> csr_array:
+    """Return the (3 k, 6 n) derivatives of the lever arms by turns of the poses in their own frames."""
+    cross = -cross_matrices(arm_m[None])[0]
+    rows = 3 * np.arange(len(before))[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
+    values, columns = [], []
+    for share, pose in ((1 - fraction, before), (fraction, after)):
+        values.append((share[:, None, None] * (path.world_from_cam[pose] @ cross)).ravel())
+        columns.append((6 * pose[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)).ravel())
+    shape = (3 * len(before), 6 * len(path))
+    return coo_array((np.concatenate(values), (np.tile(rows.ravel(), 2), np.concatenate(columns))), shape=shape).tocsr()

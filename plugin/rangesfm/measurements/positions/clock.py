@@ -211,11 +211,11 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
         found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SILENT)
     except GeometryError:
-        if track.offset_s is None:
+        if track.offset is None:
             raise
         return track
-    if track.offset_s is None:
-        return replace(track, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
+    if track.offset is None:
+        return replace(track, offset=found)
     # Of the same positions: a map that drifts fits a part of them better than all.
     offsets_s = (track.offset_s, found.value_s)
     on_both = np.logical_and(*(samples.knows(positions.times_s + each_s) for each_s in offsets_s))

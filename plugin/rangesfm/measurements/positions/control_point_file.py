@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +36,13 @@ _EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
 _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
 
 
-def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints | None:
+def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints:
     """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` another table, ODM's ``gcp_list.txt``, or Metashape's markers.
 
     A point without a kind is a control point.
 
     Args:
-        options: which name the file.
+        options: which name the file; none: there are no points.
         markers_path: file of the marks in photos; None: those of ``gcp_list.txt`` or Metashape, or printed tags.
 
     Raises:
@@ -52,12 +51,11 @@ def read_control_points(options: PointOptions, markers_path: Path | None) -> Con
     """
     path = options.path
     if path is None:
-        return None
+        return ControlPoints()
     head = read_head(path)
     markers = {} if markers_path is None else read_markers(markers_path)
     read = _gcp_list if is_gcp_list(head) else _metashape if is_metashape_file(head) else _table
-    found = replace(read(path, options, head), markers_path=markers_path)
-    return found.with_more(markers)
+    return read(path, options, head).with_more(markers)
 
 
 def is_gcp_list(head: str) -> bool:
@@ -121,7 +119,7 @@ def _points(rows: ListRows, options: PointOptions) -> ControlPoints:
         table.refuse(wrong, rows.columns["kind"], f"{CONTROL} or {CHECK}")
     each = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     points = tuple(ControlPoint(*row) for row in each)
-    return ControlPoints(points, {}, "stddev" in rows.columns, None, table.path, None, rows.notes)
+    return ControlPoints(points, {}, "stddev" in rows.columns, None, table.path, rows.notes)
 
 
 def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
@@ -160,7 +158,7 @@ def _metashape(path: Path, options: PointOptions, _head: str) -> ControlPoints:
     if not points:
         raise InputError("its markers have no coordinates: give them in another file, and this one by --markers", path)
     are_stated = all(stddev for _, stddev, _, _ in read.places.values())
-    return ControlPoints(points, markers_of_metashape(read), are_stated, crs_in_text(read.system), path)
+    return ControlPoints(points, markers_of_metashape(read, path), are_stated, crs_in_text(read.system), path)
 
 
 def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:
@@ -182,4 +180,4 @@ def _marker(name: str, seen: Sequence[tuple[str, list[float], int]], path: Path)
     photos, pixels, lines = zip(*seen, strict=True)
     if again := repeated(photos):
         raise InputError(f"point {name} is twice in {photos[again[0]]}, expected once", path, lines[again[0]])
-    return Marker(photos, np.array(pixels), lines, CLICKED_STDDEV_PX)
+    return Marker(photos, np.array(pixels), lines, CLICKED_STDDEV_PX, path)

@@ -42,16 +42,15 @@ class ControlPoints:
         markers: marks in photos, by name; a point without any is in no photo.
         stddevs_are_given: whether the file gives the standard deviations.
         crs: coordinate system named in the file; None if there is none.
-        path, markers_path: the files, for messages.
+        path: the file, for messages.
         notes: lines for the user about how the file was read.
     """
 
-    points: tuple[ControlPoint, ...]
+    points: tuple[ControlPoint, ...] = ()
     markers: Mapping[str, Marker] = field(default_factory=dict)
     stddevs_are_given: bool = True
     crs: str | None = None
     path: Path | None = None
-    markers_path: Path | None = None
     notes: tuple[str, ...] = ()
 
     @property

@@ -56,6 +56,8 @@ class PositionFit:
             deviations of a coordinate that they assume.
         lasting_s: for how long errors of an antenna's positions last.
         metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
+        is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
+            similarity is estimated.
     """
 
     similarity: Similarity
@@ -66,6 +68,7 @@ class PositionFit:
     stddev_m: Array
     lasting_s: tuple[float, ...]
     metres_per_unit: float = 1.0
+    is_at_rest: bool = False
 
     def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
         """Return the observations about a similarity, of which an antenna has at most ``max_num``."""

@@ -23,7 +23,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         InputError: the marks of a point are not of one point, or are seen from one direction only.
     """
     seen = [point for point, is_seen in zip(points.points, marks_seen(points, model), strict=True) if is_seen]
-    finder, k = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path), len(seen)
+    finder, k = MapPoints(model, {}, points.markers, np.nan), len(seen)
     found = [finder.find_marker(point.name) for point in seen]
     stddev_m = np.array([point.stddev_m for point in seen])
     return KnownPositions(

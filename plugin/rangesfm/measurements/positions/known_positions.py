@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -78,10 +77,8 @@ class KnownPositions:
         chosen |= {name: getattr(self, name)[coordinates] for name in _SPARSE}
         return KnownPositions(names=tuple(self.names[row] for row in rows.tolist()), **chosen)
 
-    def joined(self, others: KnownPositions | None) -> KnownPositions:
+    def joined(self, others: KnownPositions) -> KnownPositions:
         """Return these positions followed by others in the same model."""
-        if others is None:
-            return self
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in _ARRAYS}
         both |= {name: vstack([getattr(self, name), getattr(others, name)], format="csr") for name in _SPARSE}
         return KnownPositions(names=self.names + others.names, **both)
@@ -97,14 +94,3 @@ class KnownPositions:
 
 _SPARSE = ("by_pose", "arms_by_pose")
 _ARRAYS = tuple(field.name for field in fields(KnownPositions) if field.name not in ("names", *_SPARSE))
-
-
-def joined_positions(parts: Sequence[KnownPositions | None]) -> KnownPositions | None:
-    """Return the positions of several kinds together; None if there are none."""
-    known = [part for part in parts if part is not None and len(part)]
-    if not known:
-        return None
-    first, *others = known
-    for part in others:
-        first = first.joined(part)
-    return first

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask, median, rms
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds, most_contradicting
 from rangesfm.measurements.kind import Measurements
 from rangesfm.measurements.lengths.tape import LEFT_OUT, Marker
 from rangesfm.measurements.points import MapToFit
@@ -29,18 +29,17 @@ from rangesfm.measurements.positions.grouped_positions import (
     stddev_of,
 )
 from rangesfm.measurements.positions.known_positions import (
-    LASTING_S,
     MIN_NUM_POSITIONS,
     KnownPositions,
 )
 from rangesfm.measurements.positions.position_tests import tests_of_positions
-from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.solver.mistakes import MistakeTests
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleByKind, ScaleUncertainty, joined
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape
@@ -60,20 +59,14 @@ class PositionScale(KindOnMap):
     """k known positions on a map, and its scale and place by them alone.
 
     Attributes:
-        fit: robust one of the positions alone.
-        is_left_out: (k,) control points that contradict the others.
-        threshold: squared error of a control point, in standard deviations, above which it is left out.
-        by_themselves: as ``alone``.
-        inflation: standard deviation of the scale by the antenna's positions, divided by that for independent errors.
+        fit: robust one of the positions alone, without control points that contradict the others.
+        bending: of the map.
         surveyed: what the positions were given as.
     """
 
     fit: PositionFit
-    is_left_out: Mask
-    threshold: float
-    by_themselves: JointMap
-    inflation: float
-    surveyed: SurveyedPositions = field(default_factory=SurveyedPositions)
+    bending: MapBending
+    surveyed: SurveyedPositions
 
     kind = POSITIONS
     shows_bending = True
@@ -84,10 +77,55 @@ class PositionScale(KindOnMap):
         """The similarity of the robust fit."""
         return self.fit.similarity
 
-    @property
+    @cached_property
     def alone(self) -> JointMap:
         """The map by the positions alone, about the similarity of their fit."""
-        return self.by_themselves
+        fit = self.fit
+        return join_kinds((self,), fit.path, fit.similarity, self.bending, is_at_rest=fit.is_at_rest)
+
+    @property
+    def is_left_out(self) -> Mask:
+        """(k,) control points that contradict the others."""
+        return np.asarray(~self.known.is_check & ~self.fit.used)
+
+    @property
+    def threshold(self) -> float:
+        """Squared error of a control point, in standard deviations, above which it is left out."""
+        num_control = int(np.count_nonzero(self.known.is_mark & ~self.known.is_check))
+        return float(special.chdtri(3, FALSE_ALARM_RATE / max(num_control, 1)))
+
+    @cached_property
+    def inflation(self) -> float:
+        """Standard deviation of the scale by the antenna's positions, divided by that for independent errors."""
+        problem, used = self.alone.problem, self.alone.problem.is_used
+        linear, noise = problem.among(used)
+        as_independent, _ = linear.solved(problem.alone_m2[np.ix_(used, used)]).gains
+        grouping = self.grouped(self.alone).grouping
+        is_antenna = np.asarray(abs(grouping) @ np.repeat(~self.known.is_mark, 3) > 0)[used]
+        effects = noise.effects(np.where(is_antenna, as_independent[0], 0.0))
+        of_parts = {name: size for name, size in effects.items() if name.startswith(POSITIONS)}
+        alone = of_parts.get(POSITIONS, 0.0)
+        return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0
+
+    def without_worst(self) -> PositionScale | None:
+        """Return them without the control point that contradicts the others most; None if none does."""
+        known, used, found = self.known, self.fit.used, dict[int, PositionScale]()
+        if not len(rows := np.flatnonzero(used & known.is_mark)):
+            return None
+
+        def against_others(row: int) -> float:
+            others = used & (np.arange(len(used)) != row)
+            if int(others.sum()) < MIN_NUM_POSITIONS or not _determine(known, others):
+                return 0.0
+            found[row] = replace(self, fit=_fitted(replace(self.fit, used=others)))
+            return found[row]._statistic(row)
+
+        worst, statistic = most_contradicting(rows, self._statistic, against_others)
+        return found[worst] if statistic > self.threshold else None
+
+    def _statistic(self, row: int) -> float:
+        """Return the squared error of a control point against all positions, in standard deviations."""
+        return self.alone.problem.mistake(self.columns_of(self.alone, at_point(self.known, row))).statistic
 
     @property
     def places_map(self) -> bool:
@@ -127,7 +165,7 @@ class PositionScale(KindOnMap):
             "rms_by_axis_m": tuple(map(rms, off_m.T)) if len(off_m) else None,
             "stddev_m": median(self.stddevs_m(on_map)[used]),
             "inflation": self.inflation,
-            "time_offset_s": (track.offset_s or 0.0) if is_timed else None,
+            "time_offset_s": track.offset_s if is_timed else None,
             "time_offset_stddev_s": track.offset_stddev_s if is_timed else None,
             "antenna_in_cam_m": np.array(track.antenna_in_cam_m).tolist(),
         }
@@ -136,7 +174,7 @@ class PositionScale(KindOnMap):
     def markers(self) -> Mapping[str, Marker]:
         """Marks of the control points that take part."""
         names = (self.known.names[row] for row in np.flatnonzero(self.takes_part & self.known.is_mark).tolist())
-        return {name: self.surveyed.markers[name] for name in names}
+        return {name: self.surveyed.points.markers[name] for name in names}
 
     def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
         """Yield the control points that take part, and the positions of the antenna.
@@ -164,8 +202,7 @@ class PositionScale(KindOnMap):
     @property
     def names_left_out(self) -> list[str]:
         """Names of the control points that contradict the others, or did so before."""
-        points = () if self.surveyed.points is None else self.surveyed.points.points
-        before = [point.name for point in points if point.kind == LEFT_OUT]
+        before = [point.name for point in self.surveyed.points.points if point.kind == LEFT_OUT]
         return [*(self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()), *before]
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
@@ -235,143 +272,74 @@ def scale_by_positions(
     known: KnownPositions,
     path: Trajectory,
     bending: MapBending,
+    surveyed: SurveyedPositions = NO_POSITIONS,
     *,
     is_at_rest: bool = False,
-    lasting_s: Sequence[float] = LASTING_S,
     metres_per_unit: float = 1.0,
 ) -> PositionScale:
     """Estimate the similarity to the site by known positions alone, with contradicting control points left out.
 
     Args:
         known: positions in the model of ``path``. path: of the camera. bending: of the map.
-        is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
-            similarity is estimated.
-        lasting_s: for how long errors of the antenna's positions last, seconds.
-        metres_per_unit: as of ``PositionFit``.
+        surveyed: what the positions were given as. is_at_rest, metres_per_unit: as of ``PositionFit``.
 
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    search = _Search(known, path, is_at_rest, tuple(lasting_s), metres_per_unit)
-    search.require_enough()
-    used = ~known.is_check
-    num_control = int(np.count_nonzero(known.is_mark & used))
-    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(num_control, 1)))
-    learnt = search.learnt(bending, used, search.start(used))
-    while (worst := search.worst(bending, learnt, threshold)) is not None:
-        learnt = worst
-    fit, observed, problem = learnt
-    posterior = problem.posterior(is_refined=is_at_rest)
-    alone = JointMap((), path, fit.similarity, bending, is_at_rest, {POSITIONS: observed}, problem, posterior)
-    refuse_open_turn(posterior.place)
-    return PositionScale(fit, used & ~fit.used, threshold, alone, _inflation(learnt))
+    used = _enough(known)
+    # A start that few wrong positions do not move; that of a map at rest.
+    start = IDENTITY if is_at_rest else _of_triples(known, np.flatnonzero(used))
+    nothing = np.zeros(len(known))
+    begun = PositionFit(
+        start, known, path, used, nothing, nothing, surveyed.lasting_s, metres_per_unit, is_at_rest=is_at_rest
+    )
+    found = PositionScale(_fitted(begun), bending, surveyed)
+    while (without := found.without_worst()) is not None:
+        found = without
+    refuse_open_turn(found.alone.posterior.place)
+    return found
 
 
-class _Learnt(NamedTuple):
-    """A fit of positions, these about its similarity, and their problem with errors learnt from what the fit leaves."""
-
-    fit: PositionFit
-    observed: GroupedPositions
-    problem: JointProblem
-
-    def mistake(self, row: int) -> EstimatedMistake:
-        """Estimate by how much a known position is off."""
-        return self.problem.mistake(self.observed.grouping @ at_point(self.fit.known, row))
+def _enough(known: KnownPositions) -> Mask:
+    """Return the control positions (k,); raises GeometryError if they do not determine a similarity."""
+    if not _determine(known, ~known.is_check):
+        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+        raise GeometryError(f"{np.count_nonzero(~known.is_check)} known positions are in the map, {expected}")
+    return ~known.is_check
 
 
-def _inflation(learnt: _Learnt) -> float:
-    """Return the inflation for the scale by an antenna's positions."""
-    fit, observed, problem = learnt
-    used = problem.is_used
-    linear, noise = problem.among(used)
-    as_independent, _ = linear.solved(problem.alone_m2[np.ix_(used, used)]).gains
-    is_antenna = np.asarray(abs(observed.grouping) @ np.repeat(~fit.known.is_mark, 3) > 0)[used]
-    effects = noise.effects(np.where(is_antenna, as_independent[0], 0.0))
-    of_parts = {name: size for name, size in effects.items() if name.startswith(POSITIONS)}
-    alone = of_parts.get(POSITIONS, 0.0)
-    return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0
+def _fitted(begun: PositionFit) -> PositionFit:
+    """Fit the similarity by iteratively reweighted least squares, starting from that of the fit."""
+    known, similarity, used = begun.known, begun.similarity, begun.used
+    for _ in range(MAX_NUM_ROUNDS):
+        off_m = known.misclosures_m(similarity)
+        stddev_m = _stddevs_m(known, off_m, used)
+        away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
+        weights = used * CAUCHY.weights(away)
+        if begun.is_at_rest:  # the map has its place; only outliers are told apart
+            break
+        root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
+        by = root[:, None] * design_of_positions(known, similarity, begun.path)
+        step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
+        similarity = moved_similarity(similarity, step, begun.path)
+        if np.abs(step).max() < ROUNDING:
+            break
+    return replace(begun, similarity=similarity, weights=weights, stddev_m=stddev_m)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The fit of positions to a map; arguments as for ``scale_by_positions``."""
-
-    known: KnownPositions
-    path: Trajectory
-    is_at_rest: bool
-    lasting_s: tuple[float, ...]
-    metres_per_unit: float
-
-    def require_enough(self) -> None:
-        """Raise GeometryError if the positions do not determine a similarity."""
-        is_control = ~self.known.is_check
-        if not _determine(self.known, is_control):
-            expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
-            raise GeometryError(f"{np.count_nonzero(is_control)} known positions are in the map, {expected}")
-
-    def start(self, used: Mask) -> Similarity:
-        """Return a similarity that few wrong positions do not move; that of a map at rest."""
-        return IDENTITY if self.is_at_rest else _of_triples(self.known, np.flatnonzero(used))
-
-    def fit(self, used: Mask, start: Similarity) -> PositionFit:
-        """Fit the similarity by iteratively reweighted least squares."""
-        known, similarity = self.known, start
-        for _ in range(MAX_NUM_ROUNDS):
-            off_m = known.misclosures_m(similarity)
-            stddev_m = self._stddevs_m(off_m, used)
-            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
-            weights = used * CAUCHY.weights(away)
-            if self.is_at_rest:  # the map has its place; only outliers are told apart
-                break
-            step = self._step(similarity, off_m, weights / stddev_m**2)
-            similarity = moved_similarity(similarity, step, self.path)
-            if np.abs(step).max() < ROUNDING:
-                break
-        return PositionFit(similarity, known, self.path, used, weights, stddev_m, self.lasting_s, self.metres_per_unit)
-
-    def learnt(self, bending: MapBending, used: Mask, start: Similarity) -> _Learnt:
-        """Return the fit with what is learnt from it."""
-        fit = self.fit(used, start)
-        observed = fit.at(fit.similarity)
-        return _Learnt(fit, observed, joined([observed], bending).learnt())
-
-    def _step(self, similarity: Similarity, off_m: Array, weights: Array) -> Array:
-        root = np.repeat(np.sqrt(weights), 3)
-        by = root[:, None] * design_of_positions(self.known, similarity, self.path)
-        return np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0])
-
-    def _stddevs_m(self, off_m: Array, used: Mask) -> Array:
-        """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
-        known, stddevs = self.known, np.ones(len(self.known))
-        given = stddev_of(known.covariance_m2)
-        freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
-        # Half of all vectors of three normally distributed numbers are shorter than this.
-        median_length = np.sqrt(special.chdtri(3, 0.5))
-        for of_kind in (known.is_mark, ~known.is_mark):
-            if (rows := used & of_kind).any():
-                is_given = bool(np.isfinite(given[of_kind]).all())
-                ratio = given if is_given else np.ones(len(known))
-                shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
-                stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
-        return stddevs
-
-    def worst(self, bending: MapBending, learnt: _Learnt, threshold: float) -> _Learnt | None:
-        """Return the fit without the control point that contradicts the others most; None if none does.
-
-        The errors are learnt again without each suspect, as its own error would be taken for theirs.
-        """
-        used = learnt.fit.used
-        rows = np.flatnonzero(used & self.known.is_mark)
-        statistics = np.array([learnt.mistake(row).statistic for row in rows.tolist()])
-        found, largest = None, threshold
-        for row in rows[np.argsort(-statistics, kind="stable")[:NUM_SUSPECTS]].tolist():
-            others = used & (np.arange(len(used)) != row)
-            if int(others.sum()) <= MIN_NUM_POSITIONS - 1 or not _determine(self.known, others):
-                continue
-            without = self.learnt(bending, others, learnt.fit.similarity)
-            if (statistic := without.mistake(row).statistic) > largest:
-                found, largest = without, statistic
-        return found
+def _stddevs_m(known: KnownPositions, off_m: Array, used: Mask) -> Array:
+    """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
+    stddevs, given = np.ones(len(known)), stddev_of(known.covariance_m2)
+    freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
+    # Half of all vectors of three normally distributed numbers are shorter than this.
+    median_length = np.sqrt(special.chdtri(3, 0.5))
+    for of_kind in (known.is_mark, ~known.is_mark):
+        if (rows := used & of_kind).any():
+            is_given = bool(np.isfinite(given[of_kind]).all())
+            ratio = given if is_given else np.ones(len(known))
+            shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
+            stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
+    return stddevs
 
 
 def planned_positions(
@@ -386,9 +354,9 @@ def planned_positions(
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    search = _Search(known, path, True, tuple(lasting_s), 1.0)
-    search.require_enough()
-    return search.fit(~known.is_check, IDENTITY).at(IDENTITY, max_num)
+    nothing = np.zeros(len(known))
+    begun = PositionFit(IDENTITY, known, path, _enough(known), nothing, nothing, tuple(lasting_s), is_at_rest=True)
+    return _fitted(begun).at(IDENTITY, max_num)
 
 
 def _determine(known: KnownPositions, used: Mask) -> bool:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.measurements.positions.antenna_places import locate_antenna
-from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.control_points import ControlPoints, marks_seen
 from rangesfm.measurements.positions.known_marks import locate_points
-from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions, joined_positions
+from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -23,24 +22,23 @@ class SurveyedPositions:
     """Positions in the site's frame: of marks, and of an antenna.
 
     Attributes:
-        points: control and check points; None without any.
+        points: control and check points.
         antenna: positions of an antenna on the camera; None without any.
         lasting_s: for how long errors of the antenna's positions last, seconds.
     """
 
-    points: ControlPoints | None = None
+    points: ControlPoints = field(default_factory=ControlPoints)
     antenna: AntennaTrack | None = None
     lasting_s: tuple[float, ...] = LASTING_S
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Lines for the user about how the files were read."""
-        of_points = () if self.points is None else self.points.notes
-        return (*of_points, *(() if self.antenna is None else self.antenna.log.notes))
+        return (*self.points.notes, *(() if self.antenna is None else self.antenna.log.notes))
 
     def facts(self) -> Iterator[str]:
         """Yield lines that say what is known, before any map is made."""
-        if self.points is not None:
+        if self.points.points:
             nums = Counter(point.kind for point in self.points.points)
             kinds = " and ".join(f"{num} {kind}" for kind, num in nums.items())
             num = sum(point.name in self.points.markers for point in self.points.points)
@@ -53,15 +51,15 @@ class SurveyedPositions:
     @property
     def are_known(self) -> bool:
         """True if there are any."""
-        return self.points is not None or self.antenna is not None
+        return bool(self.points.points) or self.antenna is not None
 
     @property
     def needs_times(self) -> bool:
         """True if the photos' times are needed."""
         return self.antenna is not None and self.antenna.log.timestamp_s is not None
 
-    def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions | None:
-        """Find the positions in a model; None if none of them is there. Those by a wrong clock are left out.
+    def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
+        """Find the positions that are in a model. Those by a wrong clock are left out.
 
         Args:
             model: in any world. path: of its keyframes.
@@ -69,22 +67,23 @@ class SurveyedPositions:
         Raises:
             InputError: the marks of a point are not of one point, or are seen from one direction only.
         """
-        marks = None if self.points is None else locate_points(self.points, model, path)
-        is_on_path = self.antenna is not None and self.antenna.other_offset_s is None
-        return joined_positions([marks, locate_antenna(self.antenna, path) if self.antenna and is_on_path else None])
+        marks = locate_points(self.points, model, path)
+        if self.antenna is None or self.antenna.other_offset_s is not None:
+            return marks
+        return marks.joined(locate_antenna(self.antenna, path))
 
     def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
         """Return the positions with more marks in photos."""
-        return self if self.points is None else replace(self, points=self.points.with_more(markers))
+        return replace(self, points=self.points.with_more(markers))
 
     def without(self, names: Iterable[str]) -> SurveyedPositions:
         """Return the positions with the points of these names marked as left out."""
-        return self if self.points is None else replace(self, points=self.points.without([*names]))
+        return replace(self, points=self.points.without([*names]))
 
     def doubts_of_clock(self) -> Iterator[str]:
         """Yield the reason to doubt the given time offset of the antenna's positions, if there is one."""
         track = self.antenna
-        if track is not None and track.other_offset_s is not None and track.offset_s is not None:
+        if track is not None and track.other_offset_s is not None:
             ahead_s = track.offset_s - track.other_offset_s
             yield (
                 f"the positions fit the photos' path at a time offset of {track.other_offset_s:+.2f} s, not at the "
@@ -94,21 +93,18 @@ class SurveyedPositions:
 
     def doubts_of_found_clock(self) -> Iterator[str]:
         """Yield the reason to doubt the time offset that was found, which moves the map along the path."""
-        search = None if self.antenna is None else self.antenna.search
-        if search is not None and not search.is_certain and search.note is not None:
-            yield search.note
+        offset = None if self.antenna is None else self.antenna.offset
+        if offset is not None and not offset.is_certain and offset.note is not None:
+            yield offset.note
 
     def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
         """Yield a line for the user about points that a model does not show."""
-        if self.points is None:
-            return
         points, is_seen = self.points.points, marks_seen(self.points, model)
-        unseen = [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]
-        if unseen:
+        if unseen := [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]:
             marked = (
                 ""
-                if self.markers.keys() & {*unseen}
-                else f"; there are marks of {', '.join([*self.markers][:8]) or 'none'}"
+                if self.points.markers.keys() & {*unseen}
+                else f"; there are marks of {', '.join([*self.points.markers][:8]) or 'none'}"
             )
             yield (
                 f"{len(unseen)} of {len(points)} known points are left out, as fewer than two photos of the map have "
@@ -117,14 +113,10 @@ class SurveyedPositions:
 
     def moved(self, offset_m: Array) -> SurveyedPositions:
         """Return the positions in a frame whose coordinates are larger by ``offset_m`` (3,)."""
-        points, antenna = self.points, self.antenna
-        if points is not None:
-            points = points.moved_to(points.positions_m + offset_m)
+        points, antenna = self.points.moved_to(self.points.positions_m + offset_m), self.antenna
         if antenna is not None:
             antenna = replace(antenna, log=antenna.log.moved_to(antenna.log.position_m + offset_m))
         return replace(self, points=points, antenna=antenna)
 
-    @property
-    def markers(self) -> Mapping[str, Marker]:
-        """Marks of the points in photos, by name."""
-        return {} if self.points is None else self.points.markers
+
+NO_POSITIONS = SurveyedPositions()
