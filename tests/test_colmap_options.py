@@ -20,7 +20,7 @@ from tests.simulated.path import loop_path
 import rangesfm
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm.camera import cameras_of_photos
 from rangesfm.sfm.features import feature_options
 from rangesfm.sfm.loops.resection import resection_options
@@ -190,7 +190,7 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, *options, **__: handed.extend(options))
     matcher, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    match_share(tmp_path / "1.db", [(1, 2)], matcher, verification, tmp_path, SilentProgress())
+    match_share(tmp_path / "1.db", [(1, 2)], matcher, verification, tmp_path, Progress())
     assert (handed[0], handed[2]) == (matcher, verification)
     # The block size depends on the photos' features; in a database without any, it is one photo.
     assert changes(handed[1]) == {"match_list_path": tmp_path / "1.txt", "block_size": 1}

@@ -98,10 +98,10 @@ class OptionError(InputError):
 
     Attributes:
         table: of the survey file, without brackets.
-        key: in that table; None where the whole table is meant.
+        key: in that table; empty where the whole table is meant.
     """
 
-    def __init__(self, message: str, table: str, key: str | None = None):
+    def __init__(self, message: str, table: str, key: str = ""):
         self.table = table
         self.key = key
         super().__init__(message)

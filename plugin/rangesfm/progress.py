@@ -6,36 +6,23 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final
 
 
-class Progress(Protocol):
-    """Listener to the progress of a run. The command line prints it; a library user may ignore it."""
+class Progress:
+    """Listener to the progress of a run. This one ignores everything, which is the default; others derive from it."""
 
     def stage(self, name: str) -> None:
         """Note that a stage begins (for example ``"features"``), and that the previous one has ended."""
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
-        """Note how many items of the current stage are done, of how many (None: unknown)."""
+    def update(self, num_done: int, num_total: int = 0) -> None:
+        """Note how many items of the current stage are done, of how many (0: unknown)."""
 
     def message(self, text: str) -> None:
         """Receive one line that the user should read."""
 
 
-class SilentProgress:
-    """Listener that ignores everything: the default of every stage."""
-
-    def stage(self, name: str) -> None:
-        pass
-
-    def update(self, num_done: int, num_total: int | None = None) -> None:
-        pass
-
-    def message(self, text: str) -> None:
-        pass
-
-
-SILENT: Final[Progress] = SilentProgress()
+SILENT: Final = Progress()
 
 
 @dataclass

@@ -52,7 +52,7 @@ from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
 from rangesfm.pipeline.map_photos import find_keyframes
 from rangesfm.pipeline.run import run_survey
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.sfm.database import clear_matches
 from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.incremental_mapping import incremental_mapping
@@ -93,7 +93,7 @@ def effort_of(work: Callable[[], object]) -> Effort:
     return Effort.so_far() - begin
 
 
-class StageEfforts(SilentProgress):
+class StageEfforts(Progress):
     """Record the time whenever a stage begins."""
 
     def __init__(self) -> None:
@@ -157,7 +157,7 @@ def to_metric_map(survey: Survey, output: Path, num: int, seed: int) -> Effort:
 
 
 def compare_with_metric_map(survey: Survey, num: int, num_rounds: int, seed: int) -> None:
-    names, _ = find_keyframes(survey, Journal(SilentProgress()))
+    names, _ = find_keyframes(survey, Journal(Progress()))
     theirs, ours = [], []
     for _ in range(num_rounds):
         with tempfile.TemporaryDirectory() as scratch:
@@ -180,7 +180,7 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
     usable, log = usable_photos(photos, names), database.with_name("mapper.log")
     with colmap_log(log) as log_folder:
-        return effort_of(lambda: match_features(database, usable, options, log_folder, SilentProgress()))
+        return effort_of(lambda: match_features(database, usable, options, log_folder, Progress()))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape_file import read_tape
 from rangesfm.pipeline.ranges_for_models import ranges_of_survey
 from rangesfm.pipeline.run import scale_model
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.reference import read_reference
 
@@ -68,7 +68,7 @@ def result(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory
     output_path = tmp_path_factory.mktemp("result") / "out"
     survey = survey_of(files, {"anchors.frame": "site", "output.path": output_path, "report.enabled": False})
     survey = survey.changed({"images.model": files / "sparse" / "0"})
-    scale_model(survey, progress=SilentProgress())
+    scale_model(survey, progress=Progress())
     return survey.output.path
 
 
@@ -120,7 +120,7 @@ def test_a_results_row_is_the_same_whatever_it_is_compared_with(
     files = walked_survey.folder
     survey = survey_of(files, {"anchors.frame": "unknown", "output.path": tmp_path / "other", "report.enabled": False})
     survey = survey.changed({"images.model": files / "sparse" / "0", "ranges.check_share": 0.3})
-    scale_model(survey, progress=SilentProgress())
+    scale_model(survey, progress=Progress())
     alone, _ = compared(result, files / "sparse" / "0").rows
     other, beside = compared(tmp_path / "other", result).rows
     for row, folder in ((alone, result), (beside, result), (other, tmp_path / "other")):

@@ -15,7 +15,7 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import SolverError
 from rangesfm.pipeline.run import refine_model, scale_model
 from rangesfm.pipeline.run_results import RunResult
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.result.result_folder import is_refined_model, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
@@ -93,7 +93,7 @@ def spoilt(survey: Survey, spoil: Spoil) -> Survey:
 
 
 def refined(survey: Survey) -> RunResult:
-    return refine_model(survey, progress=SilentProgress())
+    return refine_model(survey, progress=Progress())
 
 
 def centers(path_of_model: str, survey: Survey) -> Array:
@@ -146,7 +146,7 @@ def test_where_the_model_was_none_before_nothing_is_left(survey: Survey, spoil: 
 
 
 def test_the_path_of_such_a_model_is_scaled_with_a_warning_about_its_points(survey: Survey) -> None:
-    scaled = scale_model(spoilt(survey, mix_points), progress=SilentProgress()).summary
+    scaled = scale_model(spoilt(survey, mix_points), progress=Progress()).summary
     assert scaled.scale.verdict == "doubtful"
     assert any(warning.startswith("the model's points lie") for warning in scaled.warnings)
 

@@ -19,7 +19,7 @@ from rangesfm.pipeline.close_loops import close_loops_of_survey
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import refine_model
 from rangesfm.pipeline.run_results import RunResult, write_results
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.result.result_tables import LoopPairs
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.loop_database import LoopMatching
@@ -31,15 +31,15 @@ from rangesfm.util.files.manifest import content_hash
 from rangesfm.util.geometry.similarity import rmse
 
 
-class Listener(SilentProgress):
+class Listener(Progress):
     def __init__(self) -> None:
         self.stages: list[str] = []
-        self.counts: list[tuple[int, int | None]] = []
+        self.counts: list[tuple[int, int]] = []
 
     def stage(self, name: str) -> None:
         self.stages.append(name)
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
+    def update(self, num_done: int, num_total: int = 0) -> None:
         if self.stages[-1:] == ["loops"]:
             self.counts.append((num_done, num_total))
 
@@ -90,7 +90,7 @@ class ClosedLaps:
 
     summary: ResultSummary
     last: MetricResult
-    counts: list[tuple[int, int | None]]
+    counts: list[tuple[int, int]]
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def closed(laps: Laps) -> ClosedLaps:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LoopMatching, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            refine_model(laps.survey, progress=SilentProgress())
+            refine_model(laps.survey, progress=Progress())
     written: list[MetricResult] = []
 
     def write(run: SurveyRun, made: MetricResult) -> RunResult:
@@ -152,7 +152,7 @@ def test_loops_are_closed_where_the_metres_come_from_two_lengths(tmp_path: Path)
         "report.reference": tmp_path / "reference.csv",
         "output.path": tmp_path / "out",
     }
-    made = refine_model(Survey().changed(given), progress=SilentProgress())
+    made = refine_model(Survey().changed(given), progress=Progress())
     assert made.summary.scale.verdict == "good"
     error_m = {row.name: row.rmse_sim3_m for row in made.summary.comparison}
     assert known(error_m["refined"]) < 0.5 * known(error_m["refined, loops open"])
@@ -188,7 +188,7 @@ def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: 
 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:
     survey = laps.survey.changed({"mapper.close_loops": False})
-    run = SurveyRun(survey, cast("RangingInputs", None), Journal(SilentProgress()))
+    run = SurveyRun(survey, cast("RangingInputs", None), Journal(Progress()))
     assert close_loops_of_survey(run, refined := cast("MetricResult", object())) is refined
 
 
@@ -198,5 +198,5 @@ def test_a_database_of_another_model_is_refused(laps: Laps, tmp_path: Path) -> N
     write_matches(other, looped.truth, {})
     survey = laps.survey.changed({"mapper.database_path": other, "output.path": tmp_path / "out"})
     with pytest.raises(InputError, match=r"frame_00001\.jpg has other features in the model"):
-        refine_model(survey, progress=SilentProgress())
+        refine_model(survey, progress=Progress())
     assert not (tmp_path / "out" / "result.json").exists()

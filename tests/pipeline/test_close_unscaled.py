@@ -14,7 +14,7 @@ from tests.simulated.looped import LoopedSurvey, Matches, Pair, around_a_room, t
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
 from rangesfm.pipeline.close_loops import close_loops_of_models
-from rangesfm.progress import SILENT, Journal, Progress, SilentProgress
+from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.sfm.loop_database import LoopMatching
 from rangesfm.sfm.loops.candidates import Views
 from rangesfm.sfm.loops.loop_finder import LoopFinder
@@ -25,11 +25,11 @@ from rangesfm.util.geometry.similarity import IDENTITY, align_points, rmse
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 
-class Listener(SilentProgress):
+class Listener(Progress):
     def __init__(self) -> None:
         self.lines: list[str] = []
         self.stages: list[str] = []
-        self.counts: list[tuple[int, int | None]] = []
+        self.counts: list[tuple[int, int]] = []
 
     def message(self, text: str) -> None:
         self.lines.append(text)
@@ -37,7 +37,7 @@ class Listener(SilentProgress):
     def stage(self, name: str) -> None:
         self.stages.append(name)
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
+    def update(self, num_done: int, num_total: int = 0) -> None:
         if self.stages[-1:] == ["loops"]:
             self.counts.append((num_done, num_total))
 

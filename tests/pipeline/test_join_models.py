@@ -31,7 +31,7 @@ from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.pipeline.join_models import join_models
 from rangesfm.pipeline.metric_result import ModelVerdict
 from rangesfm.pipeline.run import run_survey, scale_model
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.sfm.reconstruct import ReconstructionSummary
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -80,7 +80,7 @@ class Halves:
         arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", None)
         inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, Tape(), None, ())
         survey = Survey().changed({"scale.max_relative_stddev": 0.2})
-        journal = Journal(SilentProgress())
+        journal = Journal(Progress())
         return *join_models(SurveyRun(survey, inputs, journal), self.parts), journal.warnings
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
@@ -210,7 +210,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
 
     monkeypatch.setattr("rangesfm.pipeline.map_photos.reconstruct_in", reconstruct)
     survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
-    result = run_survey(survey, progress=SilentProgress()).summary
+    result = run_survey(survey, progress=Progress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
     assert exact.off_m(path.centers, with_scale=False) < 1e-6
@@ -237,7 +237,7 @@ def finished(exact: Halves, tmp_path_factory: pytest.TempPathFactory) -> Path:
         part.sfm.write(folder / day)
         survey = exact.write(folder).changed({"output.path": folder / day / "out"})
         survey = survey.changed({"images.model": folder / day})
-        scale_model(survey, progress=SilentProgress())
+        scale_model(survey, progress=Progress())
     return folder
 
 

@@ -22,14 +22,14 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape_file import read_tape
 from rangesfm.pipeline.check import check_survey
 from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
 
-QUIET = SilentProgress()
+QUIET = Progress()
 
 
 @dataclass(frozen=True)

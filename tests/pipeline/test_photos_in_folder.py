@@ -20,7 +20,7 @@ from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions
 from rangesfm.pipeline.check import check_survey
 from rangesfm.pipeline.map_photos import with_photos_in_folder
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import survey_from_tables
@@ -40,7 +40,7 @@ def survey(tmp_path: Path) -> Survey:
 
 
 def test_photos_times_and_camera_take_the_bags_place(survey: Survey) -> None:
-    journal = Journal(SilentProgress())
+    journal = Journal(Progress())
     changed = with_photos_in_folder(survey, journal)
     folder = survey.output.path / "photos"
     assert (changed.images.path, changed.images.times) == (folder, folder / "images.csv")
@@ -57,12 +57,12 @@ def test_photos_times_and_camera_take_the_bags_place(survey: Survey) -> None:
 def test_a_camera_that_is_given_stays(survey: Survey) -> None:
     by_folder = CameraOptions(others=(CameraOptions(images="left"),))
     for given in (survey.changed({"camera.model": "SIMPLE_RADIAL"}), survey.model_copy(update={"camera": by_folder})):
-        assert with_photos_in_folder(given, Journal(SilentProgress())).camera == given.camera
+        assert with_photos_in_folder(given, Journal(Progress())).camera == given.camera
 
 
 def test_other_times_beside_those_of_a_bag_are_refused(survey: Survey) -> None:
     with pytest.raises(InputError, match="walk: its images have their own times"):
-        with_photos_in_folder(survey.changed({"images.times": survey.ranges.path}), Journal(SilentProgress()))
+        with_photos_in_folder(survey.changed({"images.times": survey.ranges.path}), Journal(Progress()))
 
 
 def test_a_check_tells_of_a_bag_and_takes_nothing_out(survey: Survey) -> None:
@@ -126,11 +126,11 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
 
 
 def test_photos_of_a_result_stay_until_there_is_another_one(survey: Survey) -> None:
-    first = with_photos_in_folder(survey, Journal(SilentProgress()))
+    first = with_photos_in_folder(survey, Journal(Progress()))
     settings = {"images": {"path": str(first.images.path)}}
     (survey.output.path / "result.json").write_text(json.dumps(result_document(settings=settings)))
     before = {path: path.read_bytes() for path in paths_below(survey.output.path) if path.is_file()}
-    slower = with_photos_in_folder(survey.changed({"images.rate_hz": 1.0}), Journal(SilentProgress()))
+    slower = with_photos_in_folder(survey.changed({"images.rate_hz": 1.0}), Journal(Progress()))
     assert slower.images.path == survey.output.path / "photos_2"
     assert {path: path.read_bytes() for path in before} == before
-    assert with_photos_in_folder(survey, Journal(SilentProgress())) == first
+    assert with_photos_in_folder(survey, Journal(Progress())) == first

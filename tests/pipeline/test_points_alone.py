@@ -17,12 +17,12 @@ from tests.simulated.path import loop_path
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 
 Array = npt.NDArray[np.float64]
-QUIET = SilentProgress()
+QUIET = Progress()
 POINT_STDDEV_M, NUM_POINTS = 0.005, 8
 FAR_M = np.array([2_600_000.0, 1_200_000.0, 400.0])
 

@@ -22,13 +22,13 @@ from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.pipeline.run import refine_model, scale_model
 from rangesfm.pipeline.run_results import RunResult
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.similarity import rmse
 
 Array = npt.NDArray[np.float64]
-QUIET = SilentProgress()
+QUIET = Progress()
 ANTENNA_IN_CAM_M = np.array([0.05, -0.3, -0.1])
 NOISE_M, OFFSET_S = 0.05, 7.0
 ANCHORS_M = {"A1": (6.0, 1.0, 2.5), "A2": (-6.0, 2.0, 0.4), "A3": (0.5, 7.0, 3.0)}

@@ -12,7 +12,7 @@ from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 
 from rangesfm.pipeline.ranges_for_models import ranges_of_survey
 from rangesfm.pipeline.run import run_survey, scale_model
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.survey.settings import Survey
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
 
 def test_a_model_has_one_scale_by_a_survey_whoever_asks(survey: Survey) -> None:
     path = survey.given_model_path
-    scaled = scale_model(survey, progress=SilentProgress()).summary
-    assert run_survey(survey, progress=SilentProgress()).summary.scale.value == scaled.scale.value
+    scaled = scale_model(survey, progress=Progress()).summary
+    assert run_survey(survey, progress=Progress()).summary.scale.value == scaled.scale.value
     sfm = pycolmap.Reconstruction(path)
     compared = ranges_of_survey(survey, sfm, path)
     centers = {image.name: image.projection_center() for image in sfm.images.values()}

@@ -27,7 +27,7 @@ from rangesfm.pipeline import run
 from rangesfm.pipeline.export_result import export_result
 from rangesfm.pipeline.run import refine_model, scale_model
 from rangesfm.pipeline.run_results import RunResult
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.result.places import path_in, recorded_path
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
 
 
-class Listener(SilentProgress):
+class Listener(Progress):
     def __init__(self) -> None:
         self.stages: list[str] = []
         self.messages: list[str] = []
@@ -139,7 +139,7 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     assert not is_refined_model(survey.output.path / "sparse_metric" / "0"), "of another program"
     (survey.output.path / "result.json").write_text(written)
     second = survey.changed({"export.formats": (), "report.enabled": False})
-    scaled = scale_model(second, progress=SilentProgress()).summary
+    scaled = scale_model(second, progress=Progress()).summary
     assert "comparison" not in scaled.to_json()
     left = files_of(survey.output.path) - {"trajectory.tum", "points.ply"}  # exported by request, not part of a result
     scale_tables = {"scale_candidates.csv", "scale_consensus.csv"}
@@ -176,12 +176,12 @@ def test_refused_run_leaves_the_result_before_it(survey: Survey, scaled: Done) -
     before = {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)}
     strict = survey.changed({"scale.max_relative_stddev": 1e-6})
     with pytest.raises(GeometryError, match="the scale is only known to"):
-        refine_model(strict, progress=SilentProgress())
+        refine_model(strict, progress=Progress())
     assert {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)} == before
 
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:
-    result = refine_model(survey.changed({"ranges.check_share": 0.25}), progress=SilentProgress()).summary
+    result = refine_model(survey.changed({"ranges.check_share": 0.25}), progress=Progress()).summary
     with (survey.output.path / "ranges.csv").open(newline="") as file:
         statuses = Counter(row["status"] for row in csv.DictReader(file))
     num_on_path = sum(statuses[name] for name in ("used", "down-weighted", "outlier", "check"))
@@ -196,7 +196,7 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
     assert log.timestamp_s is not None
     anchor_id, times = log.anchor_ids[0], tuple(np.quantile(log.timestamp_s, [0.4, 0.5]).tolist())
     checked = survey.changed({"ranges.check_anchors": (anchor_id,), "ranges.check_times_s": times})
-    result = refine_model(checked, progress=SilentProgress()).summary
+    result = refine_model(checked, progress=Progress()).summary
     with (survey.output.path / "ranges.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["predicted_refined_m"]]
     held_out = {True: Counter[bool](), False: Counter[bool]()}
@@ -225,7 +225,7 @@ def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None
 def test_what_cannot_be_held_out_is_refused(checks: dict[str, object], frame: str, said: str, survey: Survey) -> None:
     wrong = survey.changed({"anchors.frame": frame, **{f"ranges.{key}": value for key, value in checks.items()}})
     with pytest.raises(InputError, match=said):
-        scale_model(wrong, progress=SilentProgress())
+        scale_model(wrong, progress=Progress())
 
 
 LEVER_ARMS_M = {"left": (0.15, -0.1, 0.05), "right": (-0.15, 0.05, -0.1)}
@@ -278,7 +278,7 @@ class TestSeveralTags:
     @classmethod
     def exact(cls, survey: Survey) -> RunResult:
         """The refined map with the lever arm of each tag."""
-        return refine_model(survey, progress=SilentProgress())
+        return refine_model(survey, progress=Progress())
 
     def test_map_is_exact_where_each_has_its_lever_arm(
         self, survey: Survey, exact: RunResult, made: SyntheticModel
@@ -294,7 +294,7 @@ class TestSeveralTags:
         left, right = LEVER_ARMS_M.values()
         output = survey.output.path.with_name("swapped")
         swapped = survey.changed({"tag.lever_arms_m": {"left": right, "right": left}, "output.path": output})
-        result = scale_model(swapped, progress=SilentProgress()).summary
+        result = scale_model(swapped, progress=Progress()).summary
         assert np.abs(self.centers(swapped, "sparse_scaled") - made.centers_m).max() > 0.01
         assert known(result.ranges.rms_m) > 0.05
 
@@ -314,7 +314,7 @@ class TestSeveralTags:
 def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Survey, refined: Done) -> None:
     stddevs = {"lever_arm_stddev_m": 0.05, "time_offset_stddev_s": 0.05, "short_range_stddev_m": 0.1}
     freed = survey.changed({f"refine.{key}": stddev for key, stddev in stddevs.items()})
-    result = refine_model(freed, progress=SilentProgress()).summary
+    result = refine_model(freed, progress=Progress()).summary
     found = known(result.refine)
     (tag_id,) = found.tag_in_cam_m
     assert 0 < np.linalg.norm(np.subtract(found.tag_in_cam_m[tag_id], survey.tag.tag_in_cam_m)) < 0.15
@@ -327,7 +327,7 @@ def test_what_the_refinement_found_beside_the_map_is_in_the_result(survey: Surve
 
 def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(site_survey: Survey) -> None:
     survey = site_survey.changed({"export.formats": ("tum_covariance",)})
-    result = refine_model(survey, progress=SilentProgress()).summary
+    result = refine_model(survey, progress=Progress()).summary
     path = survey.output.path / "pose_covariance.csv"
     beside_poses = (survey.output.path / "trajectory_covariance.csv").read_text()
     with path.open(newline="") as file:
@@ -342,7 +342,7 @@ def test_covariances_of_the_centres_are_in_the_result_unless_unwanted(site_surve
     exported, _ = export_result(survey.output.path, ["tum_covariance"], survey.output.path / "again")
     assert exported.read_text() == beside_poses
     assert 0 < known(known(result.refine).relative_scale_stddev) < 0.1
-    without = refine_model(survey.changed({"refine.covariance": False}), progress=SilentProgress()).summary
+    without = refine_model(survey.changed({"refine.covariance": False}), progress=Progress()).summary
     assert "without covariances of the poses there is no tum_covariance" in without.warnings
     assert known(without.refine).relative_scale_stddev is None
     assert not path.exists()
@@ -358,7 +358,7 @@ def test_a_site_in_national_coordinates_loses_nothing(site_survey: Survey, refin
     (tmp_path / "far.csv").write_text("\n".join([header, *lines]) + "\n")
     near = refined.result.summary
     moved = site_survey.changed({"anchors.path": tmp_path / "far.csv", "output.path": tmp_path / "far"})
-    away = refine_model(moved, progress=SilentProgress()).summary
+    away = refine_model(moved, progress=Progress()).summary
     assert away.metric_from_sfm.scale == pytest.approx(near.metric_from_sfm.scale, rel=1e-9)
     assert known(away.refine).scale_value == pytest.approx(known(near.refine).scale_value, rel=1e-7)
     for anchor_id, anchor in near.anchors.items():
@@ -379,7 +379,7 @@ def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Su
     known = [",".join([name, *map(repr, place.tolist())]) for name, place in zip(names[:2], places, strict=True)]
     (tmp_path / "two.csv").write_text("\n".join([header, *known, *(f"{name},,," for name in names[2:])]) + "\n")
     two = survey.changed({"anchors.path": tmp_path / "two.csv", "anchors.frame": "site"})
-    result = refine_model(two, progress=SilentProgress()).summary
+    result = refine_model(two, progress=Progress()).summary
     assert result.frame == "first_camera"
     first, second = (np.array(result.anchors[name].position_m) for name in names[:2])
     assert np.linalg.norm(first - second) == pytest.approx(np.linalg.norm(places[0] - places[1]), abs=0.01)
@@ -432,7 +432,7 @@ def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) ->
     path.write_text("an input\n")
     taped = {"scale.distances": survey.ranges.path} if key == "scale.markers" else {}
     with pytest.raises(InputError, match="the results would overwrite this input") as caught:
-        scale_model(survey.changed({**taped, key: path}), progress=SilentProgress())
+        scale_model(survey.changed({**taped, key: path}), progress=Progress())
     assert caught.value.path == path
     assert path.read_text() == "an input\n"
 
@@ -446,12 +446,12 @@ def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(
     cells[2] = str(float(cells[2]) + 3.0)
     (tmp_path / "anchors.csv").write_text("\n".join([head, ",".join(cells), *rest]) + "\n", encoding="utf-8")
     wrong = survey.changed({"anchors.path": tmp_path / "anchors.csv"})
-    told = scale_model(wrong, progress=SilentProgress()).summary
+    told = scale_model(wrong, progress=Progress()).summary
     assert told.scale.verdict == "doubtful"
     assert f"anchor {cells[0]}" in told.scale.reasons[0]
     assert told.tests[0].rejected
     assert told.tests[0].subject.startswith(cells[0])
-    mended = scale_model(wrong.changed({"scale.adopt": True}), progress=SilentProgress()).summary
+    mended = scale_model(wrong.changed({"scale.adopt": True}), progress=Progress()).summary
     assert mended.scale.verdict == "doubtful"
     assert mended.scale.reasons[0].startswith("adopted: ")
     assert told.scale.value != pytest.approx(mended.scale.value, rel=1e-6)
@@ -476,5 +476,5 @@ def test_a_survey_begins_with_its_photos_or_with_its_model(
     monkeypatch.setattr(run, "_from_model", from_model)
     images = {"path": "photos"} | ({} if model is None else {"model": model})
     survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
-    run.run_survey(survey, progress=SilentProgress())
+    run.run_survey(survey, progress=Progress())
     assert begun == [begins]

@@ -17,7 +17,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.pipeline import map_photos
 from rangesfm.pipeline.map_photos import find_keyframes, map_keyframes
 from rangesfm.pipeline.run import refine_model
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import survey_from_tables
@@ -54,7 +54,7 @@ class StereoSurvey:
             del tables["ranges"], tables["anchors"], tables["tag"]
         survey: Survey = survey_from_tables(tables, self.folder)
         survey = survey.changed({"images.model": self.folder / "sparse"})
-        return refine_model(survey, progress=SilentProgress()).summary
+        return refine_model(survey, progress=Progress()).summary
 
 
 def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -> StereoSurvey:
@@ -146,7 +146,7 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
     cameras = [{"image_prefix": LEFT, "ref_sensor": True}, {"image_prefix": RIGHT}]
     (tmp_path / "rig_config.json").write_text(json.dumps([{"cameras": cameras}]))
     tables = {"images": {"path": "images", "times": "images.csv", "rig_config": "rig_config.json"}}
-    survey, journal = survey_from_tables(tables, tmp_path), Journal(SilentProgress())
+    survey, journal = survey_from_tables(tables, tmp_path), Journal(Progress())
     keyframes, times = find_keyframes(survey, journal)
     assert keyframes == tuple(names[::2])
     assert times is not None

@@ -18,7 +18,7 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import local_site
 from rangesfm.pipeline.join_models import tie_by_photos
 from rangesfm.pipeline.place_ranges import place_ranges
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.sfm.loop_database import LoopMatching
 from rangesfm.survey.inputs import RangingInputs
@@ -38,7 +38,7 @@ def run_of(looped: LoopedSurvey, folder: Path) -> SurveyRun:
     changes = {"output.path": folder, "mapper.matching": "sequential", "ranges.time_offset": 0.0}
     times = survey.model.timestamps_s
     of_photos = ImageTimes(tuple(times), np.array(list(times.values())), 0.001, "csv")
-    return SurveyRun(Survey().changed(changes), inputs, Journal(SilentProgress()), of_photos)
+    return SurveyRun(Survey().changed(changes), inputs, Journal(Progress()), of_photos)
 
 
 def models_of(looped: LoopedSurvey, parts: Sequence[Sequence[str]]) -> list[pycolmap.Reconstruction]:

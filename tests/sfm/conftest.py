@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from rangesfm.options import CameraOptions
+from rangesfm.progress import Progress
 
 WIDTH, HEIGHT, FOCAL_LENGTH = 256, 192, 240.0
 
@@ -26,18 +27,18 @@ class Room:
     camera: CameraOptions
 
 
-class Listener:
+class Listener(Progress):
     """A Progress that records what it is told."""
 
     def __init__(self) -> None:
         self.stages: list[str] = []
-        self.updates: dict[str, list[tuple[int, int | None]]] = {}
+        self.updates: dict[str, list[tuple[int, int]]] = {}
         self.messages: list[str] = []
 
     def stage(self, name: str) -> None:
         self.stages.append(name)
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
+    def update(self, num_done: int, num_total: int = 0) -> None:
         self.updates.setdefault(self.stages[-1], []).append((num_done, num_total))
 
     def message(self, text: str) -> None:

@@ -11,14 +11,14 @@ from tests.installed import with_gpus
 from rangesfm.errors import OptionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm.features import feature_options
 from rangesfm.sfm.mapping import pipeline_options
 from rangesfm.sfm.matching import matching_options
 from rangesfm.sfm.own_process import find_features, match_share
 
 NUM_CORES = 3
-SILENT = SilentProgress()
+SILENT = Progress()
 
 
 def mapper_on(device: str) -> MapperOptions:

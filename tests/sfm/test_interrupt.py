@@ -16,6 +16,7 @@ from tests.outputs import names_in, unfinished
 
 import rangesfm
 from rangesfm.mapper_options import MapperOptions
+from rangesfm.progress import Progress
 from rangesfm.sfm.database import num_photos_with_features
 from rangesfm.sfm.reconstruct import reconstruct
 
@@ -114,15 +115,9 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
 
 
 def test_an_error_of_the_listener_stops_colmap_and_comes_through(many_photos: Room, tmp_path: Path) -> None:
-    class Broken:
-        def stage(self, name: str) -> None:
-            pass
-
-        def update(self, num_done: int, num_total: int | None = None) -> None:
+    class Broken(Progress):
+        def update(self, num_done: int, num_total: int = 0) -> None:
             raise ZeroDivisionError
-
-        def message(self, text: str) -> None:
-            pass
 
     with pytest.raises(ZeroDivisionError):
         reconstruct(

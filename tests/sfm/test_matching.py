@@ -14,7 +14,7 @@ from tests.sfm.matches import content_of
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm import matching
 from rangesfm.sfm.camera import cameras_of_photos
 from rangesfm.sfm.database import create_database
@@ -36,7 +36,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}))
-    extract_features(room.folder / "database.db", photos, options, room.folder, SilentProgress())
+    extract_features(room.folder / "database.db", photos, options, room.folder, Progress())
     return photos
 
 
@@ -84,7 +84,7 @@ def test_what_was_matched_before_an_interruption_is_kept_and_not_matched_again(
         pass
 
     class Impatient(type(listener)):  # type: ignore[misc]
-        def update(self, num_done: int, num_total: int | None = None) -> None:
+        def update(self, num_done: int, num_total: int = 0) -> None:
             if num_done >= NUM_PAIRS // 3:
                 raise InterruptedError
 

@@ -13,7 +13,7 @@ import pytest
 
 from rangesfm.errors import InputError, OptionError
 from rangesfm.mapper_options import MapperOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm.camera import cameras_of_photos
 from rangesfm.sfm.database import create_database
 from rangesfm.sfm.features import extract_features, feature_options
@@ -45,7 +45,7 @@ def database(room: Room) -> Path:
     path = room.folder / "alike.db"
     create_database(path, room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}}))
-    extract_features(path, photos, options, path.parent, SilentProgress())
+    extract_features(path, photos, options, path.parent, Progress())
     return path
 
 

@@ -25,7 +25,7 @@ from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.options import ScaleOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import map_in_metres
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -44,7 +44,7 @@ def run_stages(survey: MadeSurvey, seed: int, inputs: RangingInputs | None = Non
         inputs = RangingInputs(survey.log, arms_m, survey.anchors, survey.anchor_frame, site, Tape(), None, ())
     observations = associate(inputs.log, survey.trajectory, inputs.tag_in_cam_m, time_offset_s=survey.time_offset_s)
     path = PathOfModel("sparse/0", survey.model, survey.trajectory, observations)
-    run = SurveyRun(settings, inputs, Journal(SilentProgress()))
+    run = SurveyRun(settings, inputs, Journal(Progress()))
     return map_in_metres(run, [path], refine=survey.sfm is not None)[1]
 
 

@@ -36,7 +36,7 @@ from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.options import CameraOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm.mapping import map_photos, mapping_options, read_mapped_models
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.rigs import NO_RIGS
@@ -112,7 +112,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
     options = mapping_options(camera, mapper, NO_RIGS, 0, database)
     photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
-    map_photos(Workspace(folder, SilentProgress()), photos, options, folder)
+    map_photos(Workspace(folder, Progress()), photos, options, folder)
 
 
 def cost_of(*arguments: object) -> tuple[float, float]:

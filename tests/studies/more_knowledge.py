@@ -35,7 +35,7 @@ from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.run import map_in_metres
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -93,7 +93,7 @@ class Measured:
             inputs = replace(inputs, positions=SurveyedPositions())
         if "lengths" not in kinds:
             inputs = replace(inputs, tape=Tape())
-        run = SurveyRun(SETTINGS, inputs, Journal(SilentProgress()))
+        run = SurveyRun(SETTINGS, inputs, Journal(Progress()))
         try:
             return map_in_metres(run, [path], refine=False)[1].estimate
         except GeometryError:

@@ -34,7 +34,7 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.make_metric_map import bending_by_survey
 from rangesfm.pipeline.run import map_in_metres
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import Journal, Progress
 from rangesfm.solver.posterior import ScaleUncertainty
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -53,7 +53,7 @@ def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, Scale
     inputs = RangingInputs(
         NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), None, (), positions=known
     )
-    metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(SilentProgress())), [survey_path], refine=True)[1]
+    metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(Progress())), [survey_path], refine=True)[1]
     return metric.estimate.value, metric.estimate.uncertainty
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.errors import one_line
-from rangesfm.progress import format_duration
+from rangesfm.progress import Progress, format_duration
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -94,7 +94,7 @@ def _live(stream: TextIO) -> Live:
     return live
 
 
-class TerminalProgress:
+class TerminalProgress(Progress):
     """Listener that writes the progress of a run to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
@@ -109,7 +109,7 @@ class TerminalProgress:
         self._stage_start = self._last_update = self._clock()
         self._show(name if self._screen.is_terminal else f"{name} ...")
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
+    def update(self, num_done: int, num_total: int = 0) -> None:
         now = self._clock()
         if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._screen.is_terminal else _PLAIN_INTERVAL_S):
             self._last_update = now
@@ -142,9 +142,9 @@ def terminal_progress(stream: TextIO, *, quiet: bool = False) -> Iterator[Termin
     progress.end_stage()
 
 
-def counts(num_done: int, num_total: int | None, seconds: float = 0.0) -> str:
+def counts(num_done: int, num_total: int, seconds: float = 0.0) -> str:
     """Return "done/total, percentage" as text, with the time left if ``seconds`` is the time taken so far."""
-    if num_total is None or num_total <= 0:
+    if num_total <= 0:
         return str(num_done)
     text = f"{num_done}/{num_total}, {100 * num_done // num_total} %"
     if seconds > 0 and 0 < num_done < num_total:

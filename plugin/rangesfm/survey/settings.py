@@ -59,7 +59,7 @@ class OptionsOrigin:
 
     def located(self, error: OptionError) -> InputError:
         """Return the error of an option with the file and the line of the option."""
-        key = f"{error.table}.{error.key or ''}".strip(".")
+        key = f"{error.table}.{error.key}".strip(".")
         if any(f"{key}.".startswith(f"{other}.") for other in self.overridden):
             return InputError(str(error))
         # Unknown keys of [mapper] were moved to its pipeline; an entry of an inline table is on the table's line.

@@ -11,7 +11,7 @@ from PIL import Image
 from tests.outputs import names_in
 
 from rangesfm.errors import InputError
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Progress
 from rangesfm.sfm.image_times import read_image_times_csv
 from rangesfm.survey.sources import extract
 from rangesfm.survey.sources.extract import TakenPhotos, sharpest, take_photos
@@ -57,7 +57,7 @@ def film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Film:
 
 def take(film: Film, *, rate_hz: float = 2.0, topic: str | None = None, restart: bool = False) -> TakenPhotos:
     folder = film.path.parent / "out" / "photos"
-    return take_photos(film.path, folder, rate_hz=rate_hz, topic=topic, progress=SilentProgress(), restart=restart)
+    return take_photos(film.path, folder, rate_hz=rate_hz, topic=topic, progress=Progress(), restart=restart)
 
 
 def test_of_each_interval_the_sharpest_is_chosen_and_an_empty_one_has_none() -> None:

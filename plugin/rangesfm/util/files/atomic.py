@@ -6,7 +6,7 @@ import errno
 import os
 import unicodedata
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from rangesfm.errors import InputError
@@ -62,29 +62,18 @@ def new_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: at ``path`` is a folder, or a file that this tool did not write; it stays as it is.
     """
-    if is_private(path):
-        with _temporary(path.with_name(f".{path.stem}.part{path.suffix}")) as temporary:
-            yield temporary
-            os.replace(temporary, path)
-        return
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-    with writer_of(path) as output:
-        target = absolute(path)
-        output.require_own([target])
-        if target.is_dir():
-            raise InputError("is a folder, expected a file", path)
-        our_names: set[str | None] = {None}  # file names in errors that mean nothing to the user
-        try:
-            # The temporary file has the same ending, because libraries tell the format by it.
-            part = output.part(path.name)
-            our_names.add(str(part))
-            with _temporary(part) as temporary:
-                yield temporary
-                output.publish({target: temporary})
-        except OSError as error:  # the error of a full disk may not name the file
-            error.filename = str(path) if error.filename in our_names else error.filename
-            raise
+    if path.is_dir():
+        raise InputError("is a folder, expected a file", path)
+    meaningless: list[str | None] = [None]  # file names in errors; the error of a full disk may have none
+    try:
+        with _replacing(path) as temporary:
+            meaningless.append(str(temporary))
+            yield temporary
+    except OSError as error:
+        error.filename = str(path) if error.filename in meaningless else error.filename
+        raise
 
 
 def write_text(text: str, path: Path) -> None:
@@ -94,46 +83,56 @@ def write_text(text: str, path: Path) -> None:
 
 
 @contextmanager
-def scratch_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder, named after ``path`` and on the same file system, and remove it afterwards."""
-    if is_private(path):
-        with _temporary(path.with_name(f".{path.name}.part")) as folder:
-            folder.mkdir(parents=True)
-            yield folder
-        return
-    with writer_of(path) as output, _temporary(output.part(path.name)) as folder:
-        folder.mkdir(parents=True)
-        yield folder
-
-
-@contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder to write to; on success it takes the place of the folder ``path``.
 
     Raises:
         InputError: the earlier folder holds something that this tool did not write; all of it stays as it is.
     """
+    with _replacing(path) as folder:
+        folder.mkdir(parents=True)
+        yield folder
+
+
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder, named after ``path`` and on the same file system, and remove it afterwards."""
+    with _temporary(path) as folder:
+        folder.mkdir(parents=True)
+        yield folder
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield a place for what is to replace ``path``; in a private folder, everything may be replaced."""
     if is_private(path):
-        with scratch_folder(path) as folder:
-            yield folder
-            remove(path)
-            os.replace(folder, path)
+        with _temporary(path) as temporary:
+            yield temporary
+            if temporary.is_dir():
+                remove(path)
+            os.replace(temporary, path)
         return
     with writer_of(path) as output:
-        output.require_own([absolute(path)])
-        with scratch_folder(path) as folder:
-            yield folder
-            output.publish({absolute(path): folder})
+        target = absolute(path)
+        output.require_own([target])
+        with _temporary(path) as temporary:
+            yield temporary
+            output.publish({target: temporary})
 
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Remove whatever is at a path before the block and after it, also if the block is interrupted."""
-    try:
+    """Yield a place on the same file system as ``path``, and remove whatever is there afterwards.
+
+    The name ends as that of ``path``, because libraries tell the format of a file by it.
+    """
+    with nullcontext() if is_private(path) else writer_of(path) as output:
+        place = output.part(path.name) if output else path.with_name(f".{path.stem}.part{path.suffix}")
         try:
-            remove(path)  # a process that was killed may have left something
-            yield path
-        finally:
-            remove(path)
-    finally:  # once more, because a Ctrl-C may have interrupted the first removal
-        remove(path)
+            try:
+                remove(place)  # a process that was killed may have left something
+                yield place
+            finally:
+                remove(place)
+        finally:  # once more, because a Ctrl-C may have interrupted the first removal
+            remove(place)

@@ -40,8 +40,6 @@ class Manifest:
         self.moves: list[tuple[str, str]] = []
         self._hashes: dict[str, list[str]] = {}
         self._states: dict[str, State] = {}
-        # Size, time of change and hash of the file last announced by ``expect``; a rename keeps size and time.
-        self._expected: dict[str, tuple[tuple[int, int], str]] = {}
         if os.path.lexists(self._path):
             self._read()
 
@@ -67,26 +65,18 @@ class Manifest:
         for target, source in new.items():
             for file in _files_in(source):
                 name = self._name_of(target / file.relative_to(source))
-                state, found = state_of(file.lstat()), content_hash(file)
-                self._hashes.setdefault(name, []).append(found)
-                self._expected[name] = state[:2], found
+                self._hashes.setdefault(name, []).append(content_hash(file))
 
     def settle(self, targets: Iterable[Path]) -> None:
-        """Count only the present content of these targets as this tool's own, and no longer any earlier content."""
-        for target in targets:
-            present = {self._name_of(file): file for file in _files_in(target)}
-            name = self._name_of(target)
-            inside = [other for other in self._hashes if other == name or other.startswith(f"{name}/")]
-            for other in inside:
-                if other not in present:
-                    del self._hashes[other]
-                    self._states.pop(other, None)
-            for other, file in present.items():
-                if other in self._hashes:
-                    state = state_of(file.lstat())
-                    before, expected = self._expected.get(other, (None, ""))
-                    self._hashes[other] = [expected if before == state[:2] else content_hash(file)]
-                    self._states[other] = state
+        """Count at these targets only what was expected last as this tool's own, and no longer any earlier content."""
+        for target in map(self._name_of, targets):
+            for name in [name for name in self._hashes if name == target or name.startswith(f"{target}/")]:
+                if (file := self._folder / name).is_file():
+                    self._hashes[name] = self._hashes[name][-1:]
+                    self._states[name] = state_of(file.lstat())
+                else:
+                    del self._hashes[name]
+                    self._states.pop(name, None)
 
     def save(self) -> None:
         """Write the record, complete or not at all."""

@@ -122,13 +122,9 @@ class OutputFolder:
             moves = [(None, last), *moves, *([(new[last], last)] if last in new else [])]
         self.require_own({target for _, target in moves})
         self._manifest.expect(new)
-        self._manifest.moves = [
-            (
-                "" if source is None else source.relative_to(self.private).as_posix(),
-                target.relative_to(self.path).as_posix(),
-            )
-            for source, target in moves
-        ]
+        names = (source.relative_to(self.private).as_posix() if source else "" for source, _ in moves)
+        places = (target.relative_to(self.path).as_posix() for _, target in moves)
+        self._manifest.moves = [*zip(names, places, strict=True)]
         self._manifest.save()
         done: list[tuple[Path, Path]] = []
         try:
@@ -217,7 +213,7 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
         return
     private = key / PRIVATE_NAME
     made = [path for path in (private, key, *key.parents) if not os.path.lexists(path)]
-    lock = FileLock(key / LOCK_NAME)
+    lock = FileLock(lock_file := key / LOCK_NAME)
     make_output_folder(folder)
     is_held = False
     try:
@@ -232,8 +228,13 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
             held.close()
     finally:
         if is_held or lock.is_locked:  # a Ctrl-C may come when the lock has just been acquired
-            _release(lock, private)
-        _remove_empty(made)
+            with suppress(OSError):  # Windows does not remove an open file
+                lock_file.unlink()  # before the release, after which the file may be another process's lock
+            lock.release()
+            made = [private, *made]
+        for path in made:
+            with suppress(OSError):  # the folder is not empty
+                path.rmdir()
 
 
 @contextmanager
@@ -295,12 +296,6 @@ def remove(path: Path) -> None:
             path.unlink()
 
 
-def _remove_empty(folders: Iterable[Path]) -> None:
-    for path in folders:
-        with suppress(OSError):  # the folder is not empty
-            path.rmdir()
-
-
 def _rename(source: Path, target: Path, done: list[tuple[Path, Path]]) -> None:
     done.append((source, target))  # noted first, because an interruption may come right after the rename
     os.rename(source, target)
@@ -336,14 +331,6 @@ def _acquire(lock: BaseFileLock, folder: Path, private: Path, max_wait_s: float)
     holder = {"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": since}
     with suppress(OSError):  # on Windows a locked file cannot be written, and others are not told who holds the lock
         path.write_text(json.dumps(holder), encoding="utf-8")
-
-
-def _release(lock: BaseFileLock, private: Path) -> None:
-    """Remove and release the lock of a folder, and remove the private folder if it is empty."""
-    with suppress(OSError):  # Windows does not remove an open file
-        (private / "lock").unlink()  # before the release, after which the file may be another process's lock
-    lock.release()
-    _remove_empty([private])
 
 
 def _is_lock(path: Path) -> bool:

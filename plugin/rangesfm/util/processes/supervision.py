@@ -46,7 +46,7 @@ _CHILD = (
 _STACK_TRACE = re.compile(r"\*\*\*|@|PC:|=+ |.*\[0x[0-9a-f]+\]$")
 
 
-class MessagesToParent:
+class MessagesToParent(Progress):
     """Progress of the work as messages, one a line; only some of the many updates are sent."""
 
     def __init__(self, stream: TextIO):
@@ -57,7 +57,7 @@ class MessagesToParent:
         self._last_update = time.monotonic()
         self.send({"stage": name})
 
-    def update(self, num_done: int, num_total: int | None = None) -> None:
+    def update(self, num_done: int, num_total: int = 0) -> None:
         now = time.monotonic()
         if now - self._last_update >= _UPDATE_INTERVAL_S:
             self._last_update = now

@@ -15,6 +15,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.progress import Progress
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -414,20 +415,14 @@ def test_log_by_photos_and_photos_without_times_have_no_offset() -> None:
 
 
 def test_progress_is_told_to_the_end() -> None:
-    class Counter:
-        updates: list[tuple[int, int | None]]
+    class Counter(Progress):
+        updates: list[tuple[int, int]]
 
         def __init__(self) -> None:
             self.updates = []
 
-        def stage(self, name: str) -> None:
-            pass
-
-        def update(self, num_done: int, num_total: int | None = None) -> None:
+        def update(self, num_done: int, num_total: int = 0) -> None:
             self.updates.append((num_done, num_total))
-
-        def message(self, text: str) -> None:
-            pass
 
     walk, counter = handheld(40), Counter()
     log = walk.log(range_times(0, 40), 5.0)
