@@ -24,7 +24,7 @@ class MapperOptions(Options, table="mapper"):
     )
     """COLMAP's mapper, or another one. incremental: photo by photo; global: all photos at once; hierarchical: photo by
     photo in clusters, which are then merged; external: the program of command."""
-    command: Annotated[str | None, KeyMeta(flag="mapper_command", metavar="COMMAND")] = None
+    command: Annotated[str, KeyMeta(flag="mapper_command", metavar="COMMAND")] = ""
     """External mapper with its arguments, quoted as in a shell, but run without one. It is run in a folder with a copy
     of the database as database.db, and writes a COLMAP model to sparse/0. {images} stands for the folder of the
     photos."""
@@ -80,8 +80,8 @@ class MapperOptions(Options, table="mapper"):
         if by_tree and self.vocab_tree_path is None and "vocab_tree_path" not in self.pairing:
             message = "[mapper] vocab_tree_path is not given, expected COLMAP's vocabulary tree for this matching"
             raise OptionError(message, "mapper", "matching" if self.matching == "vocabtree" else "pairing")
-        if (self.method == "external") != (self.command is not None):
-            where = "is not given" if self.command is None else f"is given beside method {self.method}"
+        if (self.method == "external") != bool(self.command):
+            where = "is not given" if not self.command else f"is given beside method {self.method}"
             raise self.refused("command", f"{where}, expected it with method external, and only there")
         if self.method == "external" and self.pipeline:
             raise self.refused("pipeline", "is given, expected none: an external mapper takes its options in command")

@@ -172,7 +172,7 @@ class Options(BaseModel):
                 type_ = Union[tuple(arg for arg in get_args(type_) if arg is not types.NoneType)]  # noqa: UP007
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             default = field.get_default(call_default_factory=True)
-            if default is not None and default not in ((), {}):
+            if default not in (None, "", (), {}):
                 parts = default if isinstance(default, tuple) else (default,)
                 words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
                 meaning += f" (default: {','.join(words)})"

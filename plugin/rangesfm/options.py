@@ -128,7 +128,7 @@ class ImageOptions(Options, table="images"):
     """Photos per second. From a video or a bag so many are taken, the sharpest image of each interval (default: 2). For
     a folder of photos it is the fixed rate at which they were taken, in the order of the numbers in their names
     (default: the photos have times)."""
-    topic: Annotated[str | None, KeyMeta(flag="image_topic")] = None
+    topic: Annotated[str, KeyMeta(flag="image_topic")] = ""
     """Topic of the images, for a bag with several image topics."""
 
     @property
@@ -140,15 +140,15 @@ class ImageOptions(Options, table="images"):
 class CameraOptions(Options, table="camera"):
     """The cameras of the photos."""
 
-    images: Annotated[str | None, KeyMeta(flag="camera_images", metavar="PATTERN")] = None
+    images: Annotated[str, KeyMeta(flag="camera_images", metavar="PATTERN")] = ""
     """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
     as left*.jpg. One table may leave it out, for all other photos."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], KeyMeta(flag="camera_mode")] = "auto"
     """Photos of one size that have one camera. auto: those with the same make, model, serial number and focal length in
     EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
-    model: Annotated[str | None, KeyMeta(flag="camera_model")] = None
+    model: Annotated[str, KeyMeta(flag="camera_model")] = ""
     """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
-    params: Annotated[_Numbers | None, KeyMeta(flag="camera_params")] = None
+    params: Annotated[_Numbers, KeyMeta(flag="camera_params")] = ()
     """Parameters of the camera model in COLMAP's order, for photos of the most common size; they are rescaled for
     photos of another size and the same shape."""
     focal_length_stddev_px: Uncertainty | None = None
@@ -172,7 +172,7 @@ class CameraOptions(Options, table="camera"):
         Raises:
             OptionError: the photo matches the patterns of two tables.
         """
-        found = [table for table in self.others if table.images is not None and _is_of(name, table.images)]
+        found = [table for table in self.others if table.images and _is_of(name, table.images)]
         if len(found) > 1:
             patterns = " and ".join(f"'{table.images}'" for table in found)
             raise OptionError(f"[[camera]] images {patterns} both match the photo {name}, expected one", "camera")
@@ -185,14 +185,14 @@ class CameraOptions(Options, table="camera"):
         A given calibration is kept until the map is complete: few photos determine a lens badly, and a map begun with
         wrong parameters stays bent.
         """
-        if self.refine_intrinsics is None and self.params is not None:
+        if self.refine_intrinsics is None and self.params:
             return "kept" if self.focal_length_stddev_px == 0 else "refined last"
         return "kept" if self.refine_intrinsics is False else "refined"
 
     @property
     def refinement_refines_intrinsics(self) -> bool:
         if self.refine_intrinsics is None:
-            return self.params is not None and self.focal_length_stddev_px != 0
+            return bool(self.params) and self.focal_length_stddev_px != 0
         return self.refine_intrinsics
 
     def calibration_stddev_px(self, focal_length_px: float) -> float:
@@ -217,7 +217,7 @@ class RangesOptions(RangeModelOptions):
 
     path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
-    format: Annotated[str | None, KeyMeta(flag="ranges_format")] = None
+    format: Annotated[str, KeyMeta(flag="ranges_format")] = ""
     """Format of the log (default: recognised by content)."""
     columns: dict[str, str] = Field(default_factory=dict)
     """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
@@ -230,8 +230,8 @@ class RangesOptions(RangeModelOptions):
     range_unit: _LengthUnit | None = None
     """Unit of the log's ranges (default: by format, column name or values)."""
     separator: Annotated[
-        Annotated[str, Field(min_length=1, max_length=1)] | None, KeyMeta(metavar="CHARACTER", expected="one character")
-    ] = None
+        Annotated[str, Field(max_length=1)], KeyMeta(metavar="CHARACTER", expected="one character")
+    ] = ""
     """Character between the cells of a row (default: recognised)."""
     ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Time between two ranging rounds, for a Qorvo log without times of the host (default: 0.2)."""
@@ -323,7 +323,7 @@ class PositionOptions(Options, table="positions"):
     stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
     of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors; or the folder of photos, for
     those in their EXIF data."""
-    format: Annotated[str | None, KeyMeta(flag="positions_format")] = None
+    format: Annotated[str, KeyMeta(flag="positions_format")] = ""
     """Format of the file: table, tum, nmea, rtklib, marvelmind or colmap (default: recognised by content)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="position_columns")] = Field(default_factory=dict)
     """Names of the columns of a table (numbers, where they have no names) for timestamp or image_name, x, y, z, and
@@ -335,7 +335,7 @@ class PositionOptions(Options, table="positions"):
     crs: Annotated[str | None, KeyMeta(flag="position_crs")] = None
     """Coordinate reference system of the positions, such as EPSG:2056 (default: that of the format, else the frame of
     anchors and points)."""
-    tag_id: Annotated[str | None, KeyMeta(flag="position_tag_id")] = None
+    tag_id: Annotated[str, KeyMeta(flag="position_tag_id")] = ""
     """Id of the tag on the camera, for a file with positions of several."""
     antenna_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="antenna_in_cam", metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
     """Lever arm: position of the antenna, or of the prism, in the camera frame (right, down, forward), metres."""
@@ -407,7 +407,7 @@ class TagOptions(Options, table="tag"):
         default_factory=dict
     )
     """Lever arms by tag id, for a camera with several tags."""
-    tag_id: str | None = None
+    tag_id: str = ""
     """Id of the tag whose ranges are used, if the log has others (default: all tags with a lever arm)."""
 
     @model_validator(mode="after")
@@ -506,7 +506,7 @@ class ExportOptions(Options, table="export"):
     crs: Annotated[str | None, KeyMeta(flag="export_crs")] = None
     """Coordinate reference system of LAZ and GeoPackage files, such as EPSG:2056 (default: that of the anchors, else
     longitude and latitude)."""
-    origin_anchor: str | None = None
+    origin_anchor: str = ""
     """Id of an anchor whose geographic position is known."""
     origin_lat_lon_height: Annotated[
         _Place | None,
@@ -525,9 +525,9 @@ class ReportOptions(Options, table="report"):
 
     reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file", is_common=True)] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
-    title: Annotated[str | None, KeyMeta(flag="report_title", metavar="TEXT")] = None
+    title: Annotated[str, KeyMeta(flag="report_title", metavar="TEXT")] = ""
     """Title of the report. Without one it is the name of the folder."""
-    by: Annotated[str | None, KeyMeta(flag="report_by", metavar="TEXT")] = None
+    by: Annotated[str, KeyMeta(flag="report_by", metavar="TEXT")] = ""
     """Who made the survey, for the report."""
     enabled: Annotated[bool, KeyMeta(flag="report")] = True
     """Write report.html."""

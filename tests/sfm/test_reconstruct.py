@@ -128,7 +128,7 @@ class TestCamera:
                 CameraOptions(model="PINHOLE", params=(300.0, 160.0, 120.0)),
                 "3 numbers, expected 4 for PINHOLE .fx, fy, cx, cy.",
             ),
-            (CameraOptions(model=None, params=(300.0, 160.0, 120.0)), "has params but no model"),
+            (CameraOptions(params=(300.0, 160.0, 120.0)), "has params but no model"),
             (CameraOptions(model="SIMPLE_PINHOLE", params=(-3.0, 128.0, 96.0)), "expected f, cx, cy with f above 0"),
             (
                 CameraOptions(model="SIMPLE_PINHOLE", params=(1500.0, 800.0, 600.0)),

@@ -122,7 +122,7 @@ mode = "single"
 
 def test_several_cameras_are_one_for_all_photos_and_others_by_pattern(folder: Path) -> None:
     camera = read_survey(write(folder, SEVERAL_CAMERAS), {"camera.mode": "per_image"}).camera
-    assert (camera.model, camera.mode, camera.images) == ("OPENCV", "per_image", None)
+    assert (camera.model, camera.mode, camera.images) == ("OPENCV", "per_image", "")
     assert [(table.images, table.model, table.mode) for table in camera.others] == [
         ("left", "PINHOLE", "auto"),
         ("right*.png", None, "single"),

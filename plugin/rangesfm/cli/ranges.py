@@ -101,7 +101,8 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
         metavar="X,Y,Z",
         help="position of the tag's antenna in the frame whose poses are given, metres (default: 0,0,0)",
     )
-    parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
+    whose = "the tag whose positions these are, if the log has several"
+    parser.add_argument("--tag_id", default="", metavar="ID", help=whose)
     parser.add_argument(
         "--time_offset",
         type=_number_within(TIME_S),

@@ -146,9 +146,9 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
     """Return a line that says which direction is up in the exported files, where an option asked for one."""
-    if options.frame == "result" and options.origin_anchor is None:
+    if options.frame == "result" and not options.origin_anchor:
         return []
-    if options.frame == "enu" and options.origin_anchor is None:
+    if options.frame == "enu" and not options.origin_anchor:
         return ["up is perpendicular to the ellipsoid, by the anchors' coordinates"]
     from rangesfm.result.result_folder import read_result_folder
 

@@ -87,7 +87,7 @@ def cameras_as_given(
         sizes.setdefault(id(table), []).append((camera.width, camera.height))
     given = {}
     for camera_id, (table, camera) in found.items():
-        if table.model is not None and table.params is not None:
+        if table.model and table.params:
             same_size = calibrated_cameras(table.model, table.params, sizes[id(table)]).get(
                 (camera.width, camera.height)
             )

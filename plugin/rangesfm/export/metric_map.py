@@ -178,7 +178,7 @@ def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
 
 def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
     georeference = map_.georeference
-    if options.origin_anchor is not None:
+    if options.origin_anchor:
         anchor = map_.anchors_m.get(options.origin_anchor)
         if anchor is None:
             known = ", ".join(map_.anchors_m) or "none"

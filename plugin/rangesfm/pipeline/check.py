@@ -118,7 +118,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> Photos | None:
         num_photos, focal_length_px = found.of_photo.count(number), camera.mean_focal_length()
         what = f"{camera.model.name} for {num_photos} photos, f {focal_length_px:.0f} pixels"
         first = photos.names[found.of_photo.index(number)]
-        if survey.camera.of_photo(first).params is not None and first not in found.guessed:
+        if survey.camera.of_photo(first).params and first not in found.guessed:
             checked.facts.append(f"camera: {what}, as given")
         else:
             seen = "by EXIF" if camera.has_prior_focal_length else "guessed from the size of the photos"

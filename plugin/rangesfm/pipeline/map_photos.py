@@ -162,7 +162,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
     journal.note(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera
-    if taken.camera is not None and given.model is None and given.params is None and not given.others:
+    if taken.camera is not None and not (given.model or given.params or given.others):
         values["camera.model"], values["camera.params"] = taken.camera
     return survey.changed(values)
 

@@ -28,7 +28,7 @@ def check_camera(options: CameraOptions) -> None:
         InputError: an unknown model; parameters without a model; too few, too many or impossible parameters; a pattern
             of photo names where there is only one [camera] table.
     """
-    if options.images is not None and not options.others:
+    if options.images and not options.others:
         raise InputError(
             f"[camera] images is '{options.images}', expected this key only with several [[camera]] tables"
         )
@@ -37,10 +37,10 @@ def check_camera(options: CameraOptions) -> None:
 
 
 def _check_table(options: CameraOptions) -> None:
-    if options.params is None and options.focal_length_stddev_px is not None:
+    if not options.params and options.focal_length_stddev_px is not None:
         raise InputError("[camera] has focal_length_stddev_px but no params, expected params with a focal length")
-    if options.model is None:
-        if options.params is not None:
+    if not options.model:
+        if options.params:
             raise InputError("[camera] has params but no model, expected the COLMAP camera model they belong to")
         return
     if options.model not in _MODELS:
@@ -48,7 +48,7 @@ def _check_table(options: CameraOptions) -> None:
         raise InputError(
             f"[camera] model is '{options.model}', expected a COLMAP camera model; the nearest is '{nearest}'"
         )
-    if options.params is None:
+    if not options.params:
         return
     expected = pycolmap.Camera.create_from_model_name(1, options.model, 1.0, 1, 1)
     if len(options.params) != len(expected.params):
@@ -104,7 +104,7 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
     guessed: list[str] = []
     for table in options.tables:
         own = photos.subset([name for name in photos.names if table_of[name] is table])
-        if not own.names and table.images is not None:
+        if not own.names and table.images:
             raise InputError(
                 f"[[camera]] images is '{table.images}', expected a pattern that fits some photo's name, such as"
                 f" {photos.names[0]}"
@@ -123,7 +123,7 @@ def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCa
     of_photo = [groups.setdefault(key, len(groups)) for key in _keys(options.mode, photos, rigs)]
     firsts = [of_photo.index(group) for group in range(len(groups))]
     known: dict[tuple[int, int], pycolmap.Camera] = {}
-    if options.model is not None and options.params is not None:
+    if options.model and options.params:
         known = calibrated_cameras(options.model, options.params, photos.sizes)
     for camera in known.values():
         for index, size_px in zip(camera.principal_point_idxs(), (camera.width, camera.height), strict=False):
@@ -134,7 +134,7 @@ def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCa
                     " size?"
                 )
     reader = pycolmap.ImageReaderOptions()
-    if options.model is not None:
+    if options.model:
         reader.camera_model = options.model
     cameras = tuple(
         pycolmap.Camera(known[photos.sizes[first]].todict())

@@ -73,7 +73,7 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     Raises:
         InputError: a key or value that COLMAP does not have, or there is no such external mapper.
     """
-    if mapper.command is not None:
+    if mapper.command:
         return _external_mapper(mapper.command)
     options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions
     # Several threads search for an initial pair until one of them has found some pair, and Ceres adds up what they
@@ -138,7 +138,7 @@ def mapping_options(
     for name, found in camera_of_photo:
         table = camera.of_photo(name)
         # For photos of another shape than the calibrated ones COLMAP guesses the camera, and a guess is not held fixed.
-        if found.camera_id in as_given or table.params is None:
+        if found.camera_id in as_given or not table.params:
             held[table.intrinsics_in_mapping].add(found.camera_id)
     options.constant_cameras |= held["kept"]
     whole = copy.deepcopy(options)

@@ -214,7 +214,7 @@ def photo_matching(
         if given is not None:
             progress.message(given.note)
             photos = given.photos
-            is_open = all(table.model is None for table in camera.tables)
+            is_open = not any(table.model for table in camera.tables)
             cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
         if cameras.guessed:
             progress.message(

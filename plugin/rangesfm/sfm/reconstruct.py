@@ -105,7 +105,7 @@ def reconstruct_in(
     progress = unpublished.progress
     with photo_matching(image_path, image_names, camera, mapper, rigs, seed, unpublished) as matching:
         intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
-        command = [] if mapper.command is None else [mapper.command]
+        command = [mapper.command] if mapper.command else []
         of_matches = matching.plan["matching"]
         mapping = fingerprint(of_matches, mapper.method, *command, mapper.reproducible, mapper.pipeline, *intrinsics)
         placing = {} if all(rigs.are_known) else {"rigs": mapping}

@@ -159,7 +159,7 @@ def _read_radio(survey: Survey) -> tuple[RangeLog, tuple[Anchor, ...], tuple[str
     listed, anchor_notes = tuple[Anchor, ...](), tuple[str, ...]()
     if file.path is not None:
         listed, anchor_notes = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
-    tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
+    tag_ids = [*survey.tag.lever_arms_m, *([survey.tag.tag_id] if survey.tag.tag_id else [])]
     if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
     else:
@@ -358,15 +358,15 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
     return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
 
 
-def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+def of_one_tag(log: RangeLog, tag_id: str) -> RangeLog:
     """Return the ranges between one tag and anchors.
 
     Args:
         log: with ranges of any kind.
-        tag_id: of the tag; None: the log has only one.
+        tag_id: of the tag; empty: the log has only one.
 
     Raises:
-        InputError: the tag is not in the log, or the log has several tags and ``tag_id`` is None.
+        InputError: the tag is not in the log, or the log has several tags and none is named.
     """
     log = _of_wanted_tag(log, tag_id)
     log = log.subset(log.kind == RangeKind.TAG_ANCHOR)
@@ -375,9 +375,9 @@ def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
     return log
 
 
-def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
+def _of_wanted_tag(log: RangeLog, tag_id: str) -> RangeLog:
     """Return the log without the ranges of other tags. Ranges between anchors are kept."""
-    if tag_id is None:
+    if not tag_id:
         return log
     if tag_id not in log.tag_ids:
         raise InputError(f"tag {tag_id!r} is not in the log, which has {', '.join(log.tag_ids)}", log.source)
@@ -431,7 +431,7 @@ def _warnings(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> list[
         anchor.anchor_id for anchor in anchors if not survey.anchors.use and anchor.anchor_id not in log.anchor_ids
     ]
     notes = [*([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
-    silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
+    silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and not survey.tag.tag_id]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     if num := log.num_restarts:
         notes.append(

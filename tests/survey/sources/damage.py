@@ -26,7 +26,7 @@ class Damage:
             content[int(position * len(content))] = byte
         path.write_bytes(content[: int(self.kept * len(content))])
         with contextlib.suppress(InputError):
-            assert all(frame.grey().mode == "L" for frame in open_source(path, None).frames())
+            assert all(frame.grey().mode == "L" for frame in open_source(path, "").frames())
 
 
 DAMAGES = st.builds(

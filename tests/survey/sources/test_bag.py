@@ -45,7 +45,7 @@ def yuv422() -> Pixels:
     return np.stack([colours, luma], axis=-1)
 
 
-def open_bag(folder: Path, messages: list[Message], *, topic: str | None = None, **how: Any) -> PhotoSource:
+def open_bag(folder: Path, messages: list[Message], *, topic: str = "", **how: Any) -> PhotoSource:
     path = folder / ("a.bag" if how.get("version") == 1 else "a")
     return open_source(write_bag(path, messages, **how), topic)
 

@@ -35,7 +35,7 @@ class Film:
         self.path, self.frames, self.num_watched = path, frames, 0
         path.write_text("a film")
 
-    def open(self, path: Path, topic: str | None) -> PhotoSource:
+    def open(self, path: Path, topic: str) -> PhotoSource:
         return PhotoSource(
             "a film", (8, 8), 2.0, 8, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",)
         )
@@ -55,7 +55,7 @@ def film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Film:
     return film
 
 
-def take(film: Film, *, rate_hz: float = 2.0, topic: str | None = None, restart: bool = False) -> TakenPhotos:
+def take(film: Film, *, rate_hz: float = 2.0, topic: str = "", restart: bool = False) -> TakenPhotos:
     folder = film.path.parent / "out" / "photos"
     return take_photos(film.path, folder, rate_hz=rate_hz, topic=topic, progress=Progress(), restart=restart)
 

@@ -30,7 +30,7 @@ def pictures(num: int) -> list[Image.Image]:
 
 
 def test_frames_have_the_times_at_which_they_are_shown(tmp_path: Path) -> None:
-    source = open_source(write_video(tmp_path / "a.mkv", pictures(5), TIMES_S), None)
+    source = open_source(write_video(tmp_path / "a.mkv", pictures(5), TIMES_S), "")
     frames = list(source.frames())
     assert [frame.number for frame in frames] == [0, 1, 2, 3, 4]
     np.testing.assert_allclose([frame.time_s for frame in frames], np.subtract(TIMES_S, 20.0), atol=1e-3)
@@ -41,7 +41,7 @@ def test_frames_have_the_times_at_which_they_are_shown(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("created", ["2026-05-04T10:00:00Z", "2026-05-04T12:00:00+02:00"])
 def test_the_creation_time_is_the_first_frames_and_not_for_sure(created: str, tmp_path: Path) -> None:
-    source = open_source(write_video(tmp_path / "a.mp4", pictures(5), TIMES_S, created=created), None)
+    source = open_source(write_video(tmp_path / "a.mp4", pictures(5), TIMES_S, created=created), "")
     assert next(source.frames()).time_s == START_S
     assert "2026-05-04 10:00:00+00:00; that time is in whole seconds" in source.clock
     assert source.what.startswith("video, 64 x 48 pixels, 1.0")
@@ -50,11 +50,11 @@ def test_the_creation_time_is_the_first_frames_and_not_for_sure(created: str, tm
 
 def test_a_creation_time_that_nobody_set_is_none(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.mp4", pictures(2), TIMES_S[:2], created="1970-01-01T00:00:00Z")
-    assert next(open_source(path, None).frames()).time_s == 0.0
+    assert next(open_source(path, "").frames()).time_s == 0.0
 
 
 def test_photos_of_a_phone_held_upright_are_upright(tmp_path: Path) -> None:
-    source = open_source(write_video(tmp_path / "a.mp4", pictures(2), TIMES_S[:2], matrix=PORTRAIT), None)
+    source = open_source(write_video(tmp_path / "a.mp4", pictures(2), TIMES_S[:2], matrix=PORTRAIT), "")
     assert source.size_px == (48, 64)
     assert source.notes[0].startswith("the photos are turned as players show the video")
     next(source.frames()).write(tmp_path / "photo.jpg")
@@ -69,7 +69,7 @@ def test_photos_of_a_phone_held_upright_are_upright(tmp_path: Path) -> None:
 def test_what_is_no_video_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(content)
     with pytest.raises(InputError, match=r"a.mp4: cannot be read as a video \(Invalid data found"):
-        open_source(tmp_path / "a.mp4", None)
+        open_source(tmp_path / "a.mp4", "")
 
 
 def test_missing_package_is_said_with_the_command_that_installs_it(
@@ -77,7 +77,7 @@ def test_missing_package_is_said_with_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install '\.\[video\]' in a clone"):
-        open_source(tmp_path / "a.mp4", None)
+        open_source(tmp_path / "a.mp4", "")
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -85,7 +85,7 @@ def read_positions(options: PositionOptions) -> PositionLog | None:
     path = options.path
     if path is None:
         return None
-    if options.format is not None:
+    if options.format:
         if options.format not in POSITION_READERS:
             near = nearest_known(options.format, POSITION_READERS)
             raise InputError(f"unknown format of positions '{printable(options.format)}'; the nearest is '{near}'")
@@ -191,19 +191,19 @@ def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
     return all(len(values) > 0 and float(np.ptp(values)) < WIDEST_DEG for values in known)
 
 
-def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, path: Path) -> Mask:
+def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str, path: Path) -> Mask:
     """Return which rows (n,) are of the wanted tag."""
     if "tag_id" not in names:
         return np.ones(len(table), dtype=bool)
     ids = np.array(table.text(names["tag_id"], empty=""), dtype=str)
     found = sorted(set(ids.tolist()))
-    if tag_id is None and len(found) > 1:
+    if not tag_id and len(found) > 1:
         raise InputError(
             f"has positions of several tags ({', '.join(found)}): say which it is (--position_tag_id)", path
         )
-    if tag_id is not None and tag_id not in found:
+    if tag_id and tag_id not in found:
         raise InputError(f"has no position of tag {tag_id!r}, found {', '.join(found)}", path)
-    return np.asarray(ids == (found[0] if tag_id is None else tag_id))
+    return np.asarray(ids == (tag_id or found[0]))
 
 
 def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str, str]) -> Array:

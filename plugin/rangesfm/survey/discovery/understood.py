@@ -287,7 +287,7 @@ def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
         return None
     if is_source(values[PHOTOS]):
         with suppress(InputError):  # rangesfm check reports this error
-            return open_source(values[PHOTOS], values.get("images.topic")).size_px
+            return open_source(values[PHOTOS], values.get("images.topic", "")).size_px
         return None
     photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
     return Counter(photos.sizes).most_common(1)[0][0]

@@ -39,12 +39,12 @@ def has_images(path: Path) -> bool:
     return False
 
 
-def open_images(path: Path, topic: str | None) -> PhotoSource:
+def open_images(path: Path, topic: str) -> PhotoSource:
     """Open the images of a bag as a source of photos.
 
     Args:
         path: of the bag.
-        topic: of the images; None: the bag has only one image topic.
+        topic: of the images; empty: the bag has only one image topic.
 
     Raises:
         InputError: the bag cannot be read, has no images, or has several image topics and none is chosen.
@@ -73,15 +73,15 @@ def _num_by_topic(bag: AnyReader) -> dict[str, int]:
     return {topic: bag.topics[topic].msgcount for topic in sorted(images)}
 
 
-def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
+def _chosen(num_by_topic: dict[str, int], topic: str, path: Path) -> str:
     several = ", ".join(f"{name} ({num})" for name, num in num_by_topic.items())
-    if topic is None and len(num_by_topic) == 1:
+    if not topic and len(num_by_topic) == 1:
         return next(iter(num_by_topic))
     if topic in num_by_topic:
-        return str(topic)
+        return topic
     if not num_by_topic:
         raise InputError(f"no images in this bag, expected {_RAW} or {_COMPRESSED} of sensor_msgs", path)
-    which = "several topics of images" if topic is None else f"no images of {topic}; there are images of"
+    which = f"no images of {topic}; there are images of" if topic else "several topics of images"
     raise InputError(f"{which}: {several}; choose by [images] topic, or --image_topic", path)
 
 

@@ -36,7 +36,7 @@ class TakenPhotos(Record):
 
     files: _Files
     rate_hz: float
-    topic: str | None
+    topic: str
     image_names: tuple[str, ...] = ()
     camera: tuple[str, tuple[float, ...]] | None = None
     notes: tuple[str, ...] = ()
@@ -52,7 +52,7 @@ class TakenPhotos(Record):
 
 
 def take_photos(
-    path: Path, folder: Path, *, rate_hz: float, topic: str | None, progress: Progress, restart: bool = False
+    path: Path, folder: Path, *, rate_hz: float, topic: str, progress: Progress, restart: bool = False
 ) -> TakenPhotos:
     """Write the sharpest frame of each ``1 / rate_hz`` seconds as a photo, and ``images.csv`` with their times.
 
@@ -61,7 +61,7 @@ def take_photos(
         folder: for the photos. It is made or replaced when all is done. If it has these photos already, it is not
             changed.
         rate_hz: photos per second.
-        topic: of the images in a bag; None: the bag has only one image topic.
+        topic: of the images in a bag; empty: the bag has only one image topic.
         progress: is told of the stage and of the photos.
         restart: whether to extract the photos again even if the folder has them.
 
@@ -87,7 +87,7 @@ def take_photos(
     return taken
 
 
-def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str | None) -> TakenPhotos | None:
+def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str) -> TakenPhotos | None:
     """Return the record of photos that an earlier run extracted from the same source with the same choice.
 
     None where there are none, or where some are missing from ``folder``.

@@ -84,12 +84,12 @@ def is_source(path: Path) -> bool:
     return is_video(path) or is_bag(path)
 
 
-def open_source(path: Path, topic: str | None) -> PhotoSource:
+def open_source(path: Path, topic: str) -> PhotoSource:
     """Open a video or a bag and read all that is known before its frames are decoded.
 
     Args:
         path: of the source.
-        topic: of the images in a bag; None: the bag has only one image topic.
+        topic: of the images in a bag; empty: the bag has only one image topic.
 
     Raises:
         InputError: the source cannot be read, or has several image topics and none is chosen.

@@ -37,7 +37,7 @@ from rangesfm.measurements.ranges.readers.units import (
 )
 from rangesfm.measurements.ranges.twr import StampOptions, double_sided_range, single_sided_range
 from rangesfm.options import TIME_S
-from rangesfm.util.files.text_tables import FOUND, TextTable, read_table
+from rangesfm.util.files.text_tables import TextTable, read_table
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 QUANTITIES = (
@@ -86,7 +86,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     notes = [*columns.notes]
     if layout is None:
         required = dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])
-        table = read_table(path, [*required], [*columns.optional.values()], separator=options.separator or FOUND)
+        table = read_table(path, [*required], [*columns.optional.values()], separator=options.separator)
     else:
         table, more = layout.read()
         notes += more

@@ -37,7 +37,7 @@ class Reading(NamedTuple):
 
 def refuse_options_of_tables(options: ReadOptions, path: Path) -> None:
     """Raise InputError if options are given that only tables have."""
-    if options.columns or options.range_unit is not None or options.separator is not None:
+    if options.columns or options.range_unit is not None or options.separator:
         message = "the log's format is not a table: columns, range_unit and separator cannot be given"
         raise InputError(message, path)
 

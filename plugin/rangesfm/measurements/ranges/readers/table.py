@@ -22,7 +22,7 @@ from rangesfm.measurements.ranges.readers.guess import Guess, described, guess_c
 from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions, find_layout, layout_without_header
 from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.text_tables import FOUND, header_names, read_head, write_user_table
+from rangesfm.util.files.text_tables import header_names, read_head, write_user_table
 
 _BY_TIME = RangeColumns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
@@ -75,7 +75,7 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
         InputError: the columns are not known for sure. The advice gives what was found, the closest guess and the
             command to type.
     """
-    layout = find_layout(path, options.separator or "")
+    layout = find_layout(path, options.separator)
     guess = None if layout is None else guess_columns(layout)
     if (
         layout is None
@@ -164,14 +164,14 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
         raise InputError("columns must name range, timestamp (or image_name) and anchor_id where there is one", path)
     wide = _wide(told, path)
     columns = {key: name for key, name in told.items() if not key.startswith("range:")}
-    layout = find_layout(path, options.separator or "") if format == MAPPED.name else None
+    layout = find_layout(path, options.separator) if format == MAPPED.name else None
     if format == "inrol":
         layout = layout_without_header(path, _INROLS_COLUMNS, " ")
     elif layout is not None and not {*columns.values(), *wide} <= layout.units.keys():
         layout = None
     third_message = {}
     if "range" not in columns and not wide:
-        names = [*layout.units] if layout else header_names(read_head(path), options.separator or FOUND)
+        names = [*layout.units] if layout else header_names(read_head(path), options.separator)
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
@@ -241,7 +241,7 @@ def _recognizes_canonical(head: str) -> bool:
 def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
     if options.columns or options.timestamp_unit not in (None, "s"):
         raise InputError("the canonical CSV has fixed columns, with times in seconds; use format 'mapped'", path)
-    names = header_names(read_head(path), options.separator or FOUND)
+    names = header_names(read_head(path), options.separator)
     columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
     return read_columns(path, columns, options.changed(timestamp_unit=None), CANONICAL.name)
 
