@@ -37,7 +37,7 @@ setattr(module, name, function_or_death)
 sys.exit(main(argv))
 """
 IN_MATCHING = ("rangesfm.sfm.matching", "copy_matches", 0)
-IN_MAPPING = ("rangesfm.sfm.snapshots", "_keep", 3)
+IN_MAPPING = ("rangesfm.sfm.incremental_mapping", "_keep", 3)
 BEFORE_THE_RESULT = ("rangesfm.pipeline.run_results", "input_hashes", 0)
 BEFORE_THE_REPORT = ("rangesfm.pipeline.run_results", "write_report_of", 0)
 AMONG_RENAMES = ("rangesfm.util.files.output_folder", "_rename", 9)

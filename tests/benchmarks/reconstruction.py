@@ -110,12 +110,12 @@ def by_pycolmap(
     """Run pycolmap's own calls, with the given seed and camera."""
     database = output / "database.db"
     reader = pycolmap.ImageReaderOptions()
-    if camera.model is not None and camera.params is not None:
+    if camera.model and camera.params:
         reader.camera_model, reader.camera_params = camera.model, ",".join(map(repr, camera.params))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     mapping = pycolmap.IncrementalPipelineOptions(num_threads=num, random_seed=seed)
-    if camera.params is not None:
+    if camera.params:
         mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
         mapping.mapper.abs_pose_refine_focal_length = mapping.mapper.abs_pose_refine_extra_params = False
     calls = {

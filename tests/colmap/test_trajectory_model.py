@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rangesfm.colmap.trajectory_model import model_of_trajectory
+from rangesfm.colmap.model_files import model_of_trajectory
 from rangesfm.errors import InputError
 from rangesfm.sfm.image_times import times_from_file_names
 

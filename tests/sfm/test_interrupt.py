@@ -54,7 +54,7 @@ def many_photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempP
 
 def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> None:
     """Start a reconstruction, and send Ctrl-C once the step has done so much."""
-    assert room.camera.params is not None
+    assert room.camera.params
     arguments = [room.folder, output, *room.camera.params]
     command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(Path(rangesfm.__path__[0]).parent)}

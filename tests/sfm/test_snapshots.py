@@ -15,10 +15,9 @@ from tests.outputs import names_in, unfinished
 
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import SILENT, Progress
-from rangesfm.sfm import snapshots as snapshots_module
-from rangesfm.sfm.incremental_mapping import UnfinishedMapping, size_of
+from rangesfm.sfm import incremental_mapping
+from rangesfm.sfm.incremental_mapping import UnfinishedMapping, size_of, snapshots
 from rangesfm.sfm.reconstruct import reconstruct
-from rangesfm.sfm.snapshots import snapshots
 
 if TYPE_CHECKING:
     from tests.sfm.conftest import Listener, Room
@@ -76,11 +75,11 @@ def interrupted(mapping: Mapping, monkeypatch: pytest.MonkeyPatch) -> Callable[[
             if len(kept) == num_snapshots:
                 raise RuntimeError("killed")
 
-        keep = snapshots_module._keep
+        keep = incremental_mapping._keep
         with monkeypatch.context() as patched:
-            patched.setattr(snapshots_module, "_keep", keep_and_interrupt)
-            patched.setattr(snapshots_module, "_MIN_INTERVAL_S", 0.0)
-            patched.setattr(snapshots_module, "_INTERVAL_OVER_DURATION", 0.0)
+            patched.setattr(incremental_mapping, "_keep", keep_and_interrupt)
+            patched.setattr(incremental_mapping, "_MIN_INTERVAL_S", 0.0)
+            patched.setattr(incremental_mapping, "_INTERVAL_OVER_DURATION", 0.0)
             with pytest.raises(Exception, match="killed"):
                 mapping.run()
         return mapping

@@ -6,8 +6,8 @@ import hashlib
 from pathlib import Path
 
 from rangesfm.options import AnchorOptions, ImageOptions, RangesOptions, ReportOptions, ScaleOptions
-from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import input_hashes
 
 
 def photos(folder: Path, **sizes: int) -> Path:

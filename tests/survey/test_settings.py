@@ -87,7 +87,7 @@ def test_whole_survey_is_read(folder: Path) -> None:
     assert survey.images.times == folder / "images.csv"
     assert survey.images.every_nth == 3
     assert survey.camera.model == "OPENCV"
-    assert survey.camera.params is not None
+    assert survey.camera.params
     assert survey.camera.params[:3] == (377.25, 431.78, 308.0)
     assert survey.ranges.path == folder / "uwb.csv"
     assert survey.ranges.time_offset_s is None

@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
+from rangesfm import __version__
 from rangesfm.cli.help_pages import HelpSection, Parser
 from rangesfm.progress import Progress
 
 # Modules with commands, in the order in which the help lists the commands.
-_MODULES = ("begin", "stages", "batch", "planning", "results", "ranges", "doctor")
+_MODULES = ("begin", "stages", "batch", "results", "ranges")
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class Commands(Parser):
             "  rangesfm COMMAND --help  everything about it; options may be spelt with _ or -",
         )
         self.more = None
-        self.general.add_argument("--version", action=_PrintVersion)
+        version = f"rangesfm {__version__}"
+        self.general.add_argument("--version", action="version", version=version, help="print the version")
         self.by_name: dict[str, Parser] = {}
         self.listed: dict[bool, list[argparse.Action]] = {True: [], False: []}
         self._subparsers_of_commands = self.add_subparsers(prog="rangesfm", metavar="COMMAND", parser_class=Parser)
@@ -120,13 +122,3 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         nearest = difflib.get_close_matches(name, parser._option_string_actions, 1)
         parser.error(f"unknown option {name}" + (f"; the nearest known one is {nearest[0]}" if nearest else ""))
     return args
-
-
-class _PrintVersion(argparse.Action):
-    def __init__(self, option_strings: Sequence[str], dest: str):
-        super().__init__(option_strings, dest, nargs=0, help="print the version")
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        raise SystemExit(f"rangesfm {version('rangesfm')}")

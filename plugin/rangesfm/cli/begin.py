@@ -1,4 +1,4 @@
-"""The commands that come before a first run: ``init`` and ``check``."""
+"""The commands that come before a first run: ``init``, ``check`` and ``plan``, and ``doctor``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesfm.cli.survey_flags import (
     overrides_from_arguments,
     survey_from_arguments,
 )
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -32,6 +32,13 @@ def add_begin_commands(commands: Commands) -> None:
         "check", _check, "say in seconds what a run would read, and what is wrong with it", is_common=True
     )
     add_survey_arguments(check)
+    plan = commands.add(
+        "plan", _plan, "say before a survey how accurate it will be, and what to change", is_common=True
+    )
+    plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="file with anchors, path and radio")
+    plan.add_argument("--from", dest="result", metavar="RESULT", help="plan another survey like this finished one")
+    plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json and plan.html into this folder")
+    commands.add("doctor", _doctor, "check the installation: versions, and whether the compiled part fits them")
 
 
 def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
@@ -105,3 +112,53 @@ def told(checked: CheckedSurvey, *, fault: str) -> list[str]:
         *(f"warning: {text}" for text in checked.warnings),
         *("\n  ".join([f"{fault}: {error}", *error.advice]) for error in checked.faults),
     ]
+
+
+def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Compute what a run of a survey would say, before any range is measured: how accurately the scale and the place
+    of the map will be known, which mistakes would be found, and which change of anchors, path or radio would help
+    most. If a run would refuse the scale, the exit status is 3; all is printed and written nevertheless.
+
+    example:
+      rangesfm plan plan.toml --output_path plan
+      rangesfm plan --from out
+    """
+    if (args.plan is None) == (args.result is None):
+        raise InputError("expected either the file of a plan or --from RESULT")
+    from rangesfm.planning.placement import place_anchors
+    from rangesfm.planning.plan_file import read_plan
+    from rangesfm.planning.survey_plan import REFUSED, plan_survey
+    from rangesfm.report.plan_page import write_plan
+    from rangesfm.util.files.atomic import require_apart
+
+    if args.output_path is not None:
+        require_apart([Path(args.plan or args.result)], Path(args.output_path))
+    if args.plan is not None:
+        planned = place_anchors(read_plan(args.plan), progress)
+    else:
+        from rangesfm.pipeline.plan_again import plan_of_result
+
+        planned = plan_of_result(args.result)
+    plan = plan_survey(planned)
+    for warning in plan.warnings:
+        progress.message(warning)
+    written = [] if args.output_path is None else map(str, write_plan(plan, Path(args.output_path)))
+    return Outcome([*plan.lines, *written], GeometryError.exit_status if plan.verdict == REFUSED else 0)
+
+
+def _doctor(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Check versions and threads, and that the compiled part shares its types with pycolmap and pyceres.
+
+    example:
+      rangesfm doctor
+    """
+    from rangesfm.solver.installation_checks import diagnose
+    from rangesfm.util.files.text_tables import align_rows
+
+    checks = diagnose()
+    rows = []
+    for check in checks:
+        rows.append(("ok" if check.ok else "BAD", check.name, check.found))
+        if not check.ok:
+            rows.append(("", "", f"expected {check.expected}; {check.remedy}"))
+    return Outcome([align_rows(rows, num_left=3)], 0 if all(check.ok for check in checks) else SolverError.exit_status)

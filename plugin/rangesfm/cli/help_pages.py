@@ -65,6 +65,9 @@ class Parser(argparse.ArgumentParser):
             self.later.pop(0)(self)
         return super().parse_known_args(args, namespace)
 
+    def _print_message(self, message: str, file: object = None) -> NoReturn:
+        raise SystemExit(message.rstrip("\n"))
+
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} -h)")
 

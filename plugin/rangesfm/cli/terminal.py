@@ -22,13 +22,11 @@ _PLAIN_INTERVAL_S = 10.0
 _GROWING_STAGES = ("rigs", "mapping")
 
 
-def discard_output(stream: TextIO | None) -> None:
+def discard_output(stream: TextIO) -> None:
     """Discard what is written to a stream from now on, and what it has not been able to write.
 
     Otherwise Python would try to write that again when it exits, and complain.
     """
-    if stream is None:  # the shell has closed it
-        return
     with suppress(OSError, ValueError):  # there is no file behind the stream
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 

@@ -1,4 +1,4 @@
-"""Reading of COLMAP models, with the checks that COLMAP itself does not make."""
+"""Reading of COLMAP models, with the checks that COLMAP itself does not make, and of trajectories as models."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from rangesfm.errors import InputError
 from rangesfm.util.files.atomic import is_plain_name
 from rangesfm.util.files.contents import open_regular
 from rangesfm.util.files.text_tables import read_text
+from rangesfm.util.geometry.reference import read_reference
 
 MAX_COORDINATE = 1e12
 """Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""
@@ -373,3 +374,24 @@ def _check_map_of_text(model: pycolmap.Reconstruction, path: Path) -> None:
         write_binary_model(model, Path(folder))
         images, points = (read_records(Path(folder) / name) for name in ("images.bin", "points3D.bin"))
     check_map(replace(images, path=path), replace(points, path=path))
+
+
+def model_of_trajectory(path: Path) -> pycolmap.Reconstruction:
+    """Return the poses of a file as a model without points: a TUM trajectory, or the CSV of ``read_reference``.
+
+    The poses are world from camera, in any unit. Poses by time get photos that are named after the time in seconds.
+
+    Raises:
+        InputError: the file is not valid, or has no rotations.
+    """
+    poses = read_reference(path)
+    if poses.world_from_cam is None:
+        raise InputError("has positions without rotations, expected timestamp tx ty tz qx qy qz qw", path)
+    names = poses.image_names or [f"{time:.6f}.png" for time in np.asarray(poses.timestamps_s).tolist()]
+    model = pycolmap.Reconstruction()
+    # Poses have no pixels; the camera is only there because a model has one.
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1000.0, 1000, 1000))
+    for number, (name, turn, place) in enumerate(zip(names, poses.world_from_cam, poses.positions_m, strict=True), 1):
+        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), place).inverse()
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), cam_from_world)
+    return model

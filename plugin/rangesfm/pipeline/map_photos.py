@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.model_files import model_of_trajectory, read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.reprojection import wrong_axes
-from rangesfm.colmap.trajectory_model import model_of_trajectory
 from rangesfm.diagnostics.preflight import (
     check_units,
     notes_before_work,

@@ -24,9 +24,9 @@ from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_resul
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.steps import DATABASE_NAME
 from rangesfm.solver.installation_checks import recorded_versions
-from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import input_hashes
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import path_of
 from rangesfm.util.geometry.georeference import Georeference

@@ -1,6 +1,8 @@
-"""Device that computes features and matches: the processor or a GPU."""
+"""What computes features and matches: the processor or a GPU, and which methods the installed pycolmap has."""
 
 from __future__ import annotations
+
+import pycolmap
 
 from rangesfm.errors import OptionError
 from rangesfm.installed_versions import OTHER_BUILDS, num_gpus
@@ -31,3 +33,20 @@ def refuse_missing_gpu(use_gpu: bool, table: str) -> None:
     """
     if use_gpu and num_gpus() == 0:
         raise OptionError(f"[{table}] use_gpu is true, expected false: pycolmap finds no GPU", table, "use_gpu")
+
+
+def refuse_learned(name: str, table: str) -> None:
+    """Refuse learned features and learned matching where pycolmap is built without them.
+
+    Raises:
+        OptionError: ``name``, the key ``type`` of the table, is a learned method and pycolmap cannot run it.
+    """
+    if not name.startswith("SIFT") or name.endswith("LIGHTGLUE"):
+        known = pycolmap.FeatureExtractionOptions().todict()
+        if "aliked" not in known:
+            raise OptionError(
+                f"[{table}] type is '{name}', expected SIFT: the installed pycolmap {pycolmap.__version__} is built"
+                " without ONNX, which runs networks; use database_path for features of other programs",
+                table,
+                "type",
+            )

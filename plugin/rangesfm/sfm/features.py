@@ -8,11 +8,11 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.errors import OptionError, ReconstructionError
+from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.sfm.database import num_photos_with_features
-from rangesfm.sfm.device import refuse_missing_gpu, uses_gpu
+from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
 from rangesfm.sfm.own_process import find_features
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS, Photos
 from rangesfm.util.processes.supervision import run_child
@@ -33,23 +33,6 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
     refuse_learned(options.type.name, "mapper.features")
     refuse_missing_gpu(options.use_gpu, "mapper.features")
     return options
-
-
-def refuse_learned(name: str, table: str) -> None:
-    """Refuse learned features and learned matching where pycolmap is built without them.
-
-    Raises:
-        OptionError: ``name``, the key ``type`` of the table, is a learned method and pycolmap cannot run it.
-    """
-    if not name.startswith("SIFT") or name.endswith("LIGHTGLUE"):
-        known = pycolmap.FeatureExtractionOptions().todict()
-        if "aliked" not in known:
-            raise OptionError(
-                f"[{table}] type is '{name}', expected SIFT: the installed pycolmap {pycolmap.__version__} is built"
-                " without ONNX, which runs networks; use database_path for features of other programs",
-                table,
-                "type",
-            )
 
 
 def extract_features(

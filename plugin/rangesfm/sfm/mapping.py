@@ -23,11 +23,16 @@ from rangesfm.options import CameraOptions
 from rangesfm.sfm.background import run_in_background
 from rangesfm.sfm.database import num_matching_pairs
 from rangesfm.sfm.device import uses_gpu
-from rangesfm.sfm.incremental_mapping import UnfinishedMapping, adjust_whole, incremental_mapping
+from rangesfm.sfm.incremental_mapping import (
+    UnfinishedMapping,
+    adjust_whole,
+    incremental_mapping,
+    newest_snapshot,
+    snapshots,
+)
 from rangesfm.sfm.own_process import WholePipelineOptions, map_at_once, run_program
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.rigs import Rigs
-from rangesfm.sfm.snapshots import newest_snapshot, snapshots
 from rangesfm.sfm.steps import DATABASE_NAME, MODELS_NAME, Workspace
 from rangesfm.util.files.atomic import new_folder, scratch_folder
 from rangesfm.util.processes.supervision import run_child

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.glog import logging_into
+from rangesfm.colmap.colmap_log import logging_into
 from rangesfm.progress import Progress
 from rangesfm.sfm.background import run_in_background
 from rangesfm.util.processes.supervision import end_group_with_parent

@@ -1,7 +1,8 @@
-"""Reading of surveys: from a TOML file, from flags or from both, and the files that a survey names."""
+"""Reading of surveys: from a TOML file, from flags or from both, and the files that a survey names, with hashes."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
@@ -17,7 +18,8 @@ from rangesfm.option_model import PathRole
 from rangesfm.options import CameraOptions
 from rangesfm.survey.settings import ROLE_OF_PATH, SURVEY_TABLES, OptionsOrigin, Survey
 from rangesfm.util.files.atomic import path_of
-from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.contents import AnyPath, sha256_of
+from rangesfm.util.files.folders import walk
 from rangesfm.util.files.text_tables import read_text
 
 if sys.version_info >= (3, 11):
@@ -182,3 +184,34 @@ def input_paths(survey: Survey) -> Iterator[tuple[str, PathRole, Path]]:
             yield dotted_key, "photos" if path.is_dir() else "file", path
         elif path is not None and role != "output":
             yield dotted_key, role, path
+
+
+def input_hashes(survey: Survey) -> list[dict[str, Any]]:
+    """Return path, SHA-256, number of bytes and what was hashed, for each input that exists.
+
+    For a folder of photos, only names and sizes are hashed: reading gigabytes again would take too long.
+    """
+    entries: list[dict[str, Any]] = []
+    for _, role, given in input_paths(survey):
+        if role == "photos":
+            entries += [_folder(given)] if given.is_dir() else []
+        else:
+            files = sorted(given.glob("*.bin" if role == "model" else "*")) or [given]
+            entries += [
+                {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
+                for path in files
+                if path.is_file()
+            ]
+    return entries
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    files = (parent / name for parent, _, names in walk(path) for name in names)
+    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in files if file.is_file()}
+    listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
+    return {
+        "path": str(path),
+        "sha256": hashlib.sha256(listing.encode("utf-8", "surrogateescape")).hexdigest(),
+        "bytes": sum(sizes.values()),
+        "hashed": f"names and sizes of {len(sizes)} files",
+    }

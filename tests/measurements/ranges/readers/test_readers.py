@@ -199,7 +199,7 @@ def test_range_units(tmp_path: Path, unit: str, metres: float) -> None:
 @pytest.mark.parametrize("separator", [",", ";", "\t", " ", "|"])
 def test_separators(tmp_path: Path, separator: str) -> None:
     content = f"t,node,d\n{0.5},7,3\n".replace(",", separator)
-    given = None if separator in ",;\t " else separator
+    given = "" if separator in ",;\t " else separator
     log = read_ranges(write(tmp_path, content), columns=MAPPING, separator=given)
     np.testing.assert_array_equal(log.range_m, [3])
 

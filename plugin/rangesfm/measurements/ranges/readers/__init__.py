@@ -16,7 +16,7 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.errors.noise import find_quantization_m, quantization_stddev_m
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import ros, trek
-from rangesfm.measurements.ranges.readers.held import without_held
+from rangesfm.measurements.ranges.readers.measured import without_held
 from rangesfm.measurements.ranges.readers.printed import PRINTED
 from rangesfm.measurements.ranges.readers.reader import Reader, ReadOptions, tell_roles
 from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv

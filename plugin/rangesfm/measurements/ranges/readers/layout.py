@@ -22,12 +22,26 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.measurements.ranges.readers.angles import spelt_angle
-from rangesfm.measurements.ranges.readers.gsi import gsi_records, is_gsi
 from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
 from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS
 from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, read_head, read_text
+
+_ANGLE = re.compile(
+    r"([NSEW]?) ?(-?)(\d{1,3}(?:\.\d+)?) ?(?:°|º|deg) ?(?:(\d{1,2}(?:\.\d+)?) ?['’′])? ?"
+    r"(?:(\d{1,2}(?:\.\d+)?) ?(?:\"|''|″|”))? ?([NSEW]?)",
+    re.ASCII,
+)
+
+
+def _spelt_angle(text: str) -> float | None:
+    """Return the degrees of an angle in degrees, minutes and seconds, south and west negative; None for other text."""
+    found = _ANGLE.fullmatch(text.replace(",", "."))
+    if found is None or bool(found[1]) + bool(found[2]) + bool(found[6]) > 1:
+        return None
+    size = float(found[3]) + float(found[4] or 0) / 60 + float(found[5] or 0) / 3600
+    return -size if found[2] or "S" in (found[1], found[6]) or "W" in (found[1], found[6]) else size
+
 
 # fmt: off
 MISSING = (
@@ -88,7 +102,7 @@ class Cure:
         if self.are_dates:
             return spelt_date(cell) or cell
         if self.are_angles:
-            return cell if (angle := spelt_angle(cell)) is None else f"{angle:.12g}"
+            return cell if (angle := _spelt_angle(cell)) is None else f"{angle:.12g}"
         found = _WITH_UNIT.fullmatch(cell) if self.unit else None
         number = found[1] if found and found[2] == self.unit else cell
         if self.thousands and _GROUPED.fullmatch(number):
@@ -159,7 +173,7 @@ class ColumnSample:
         """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
         if self.filled and all(map(spelt_date, self.filled)):
             return self._with(Cure(are_dates=True))
-        if self.filled and not any(spelt_angle(cell) is None for cell in self.filled):
+        if self.filled and not any(_spelt_angle(cell) is None for cell in self.filled):
             return self._with(Cure(are_angles=True))
         units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
         unit = next(iter(units)) if len(units) == 1 else ""
@@ -373,8 +387,8 @@ def _read_records(path: Path) -> TextTable | None:
     A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
     """
     head = read_head(path).lstrip()
-    if is_gsi(head):
-        numbered = [*gsi_records(read_text(path, errors="replace"))]
+    if _is_gsi(head):
+        numbered = [*_gsi_records(read_text(path, errors="replace"))]
     elif head.startswith(("{", "[{")) or _share_json(head) > _MIN_SHARE_JSON:
         numbered = list(_json_records(read_text(path)))
     elif _share_named(head) > _MIN_SHARE_NAMED:
@@ -495,3 +509,34 @@ def _common_and_each(value: Any, name: str) -> tuple[NamedValues, list[NamedValu
     found = [_common_and_each(item, f"{within}{key}") for key, item in inner]
     whole = {key: cell for common, _ in found for key, cell in common.items()}
     return whole, [record for _, each in found for record in each]
+
+
+_GSI_WORD = re.compile(r"(\d\d)[\d.]{3}([\d.])([+-])(\w{16}|\w{8})(?=\s|$)", re.ASCII)
+_GSI_BLOCK = re.compile(r"\*?11\d{4}[+-]", re.ASCII)
+_GSI_POINT = "11"
+# Word indices of east, north and height: of the point that was measured, or else of the station.
+_GSI_COORDINATES = (("81", "82", "83"), ("84", "85", "86"))
+# Length of one unit in the last place, in metres, by the digit for units.
+_GSI_METRES = {"0": 1e-3, "1": 0.3048e-3, "6": 1e-4, "7": 0.3048e-4, "8": 1e-5}
+
+
+def _is_gsi(head: str) -> bool:
+    """Return whether a file with this beginning is a GSI file with measured points."""
+    return _GSI_BLOCK.match(head.lstrip()) is not None
+
+
+def _gsi_records(text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield point, east, north and height (metres) of each block that has coordinates, with its line number."""
+    for line, block in enumerate(text.split("\n"), 1):
+        words = {found[1]: found for found in _GSI_WORD.finditer(block)}
+        indices = next((three for three in _GSI_COORDINATES if {*three} & words.keys()), None)
+        if _GSI_BLOCK.match(block.lstrip()) and _GSI_POINT in words and indices is not None:
+            names = ("east m", "north m", "height m")
+            values = (_metres(words[index]) if index in words else "" for index in indices)
+            yield line, {"point": words[_GSI_POINT][4].lstrip("0") or "0", **dict(zip(names, values))}
+
+
+def _metres(word: re.Match[str]) -> str:
+    """Return a word's value in metres as text, or the word as it is, which is no number, if its unit is not known."""
+    unit_m = _GSI_METRES.get(word[2])
+    return word[0] if unit_m is None or not word[4].isdigit() else f"{int(word[3] + word[4]) * unit_m:.5f}"
