@@ -125,7 +125,7 @@ def test_several_cameras_are_one_for_all_photos_and_others_by_pattern(folder: Pa
     assert (camera.model, camera.mode, camera.images) == ("OPENCV", "per_image", "")
     assert [(table.images, table.model, table.mode) for table in camera.others] == [
         ("left", "PINHOLE", "auto"),
-        ("right*.png", None, "single"),
+        ("right*.png", "", "single"),
     ]
     assert camera.of_photo("left/1.jpg") is camera.others[0]
     assert camera.of_photo("leftover/1.jpg") is camera

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rangesfm.colmap.colmap_log import logging_into
+from rangesfm.colmap.glog import logging_into
 from rangesfm.errors import OptionError, nearest_known, printable, shown
 
 _EXPECTED = {

@@ -131,7 +131,8 @@ def _check_mapper(survey: Survey, photos: Photos, checked: CheckedSurvey) -> Non
     with survey.source.naming_lines():
         feature_options(mapper)
         matching_options(mapper, len(photos.names), survey.output.seed)
-    if masks := contents_of_masks(mapper.mask_path, photos):
+    if mapper.mask_path is not None:
+        masks = contents_of_masks(mapper.mask_path, photos)
         checked.facts.append(f"masks: of {len(masks)} photos")
     with TemporaryDirectory() as scratch, opened(mapper.database_path, photos, Path(scratch)) as given:
         if given is not None:

@@ -34,7 +34,7 @@ from rangesfm.sfm.mapping import pipeline_options
 from rangesfm.sfm.reconstruct import reconstruct_in
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
-from rangesfm.sfm.tags import find_tags
+from rangesfm.sfm.tags import find_tags, names_of_tags, sides_of_tags
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
@@ -217,18 +217,19 @@ def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
         return run
     folder = survey.photos_path
     with journal.stage("tags"):
-        found = find_tags(folder, names, wanted.dictionary, journal.progress)
-    if not found.markers:
+        markers = find_tags(folder, names, wanted.dictionary, journal.progress)
+    if not markers:
         message = (
             f"no tag of {wanted.dictionary} in {len(names)} photos: is it another dictionary ([markers] dictionary)?"
         )
         if not len(inputs.log) and survey.scale.distances is None and survey.points.path is None:
             raise InputError(message, folder)
         journal.warn(message)
-    journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
-    sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    tape = inputs.tape.with_more(sides).with_more_markers(found.markers)
-    positions = inputs.positions.with_more_markers(found.markers)
+    num_photos = len({name for marker in markers.values() for name in marker.image_names})
+    journal.progress.message(f"tags: {len(names_of_tags(markers))} of {wanted.dictionary} in {num_photos} photos")
+    sides = () if wanted.side_m is None else sides_of_tags(markers, wanted.side_m, wanted.side_stddev_m)
+    tape = inputs.tape.with_more(sides).with_more_markers(markers)
+    positions = inputs.positions.with_more_markers(markers)
     return replace(run, inputs=replace(inputs, tape=tape, positions=positions))
 
 

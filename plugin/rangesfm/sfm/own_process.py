@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import logging_into
+from rangesfm.colmap.glog import logging_into
 from rangesfm.progress import Progress
 from rangesfm.sfm.background import run_in_background
 from rangesfm.util.processes.supervision import end_group_with_parent
@@ -28,18 +28,12 @@ def find_features(
     database_path: Path,
     image_path: Path,
     image_names: Sequence[str],
-    mask_path: Path | None,
+    reader: pycolmap.ImageReaderOptions,
     options: pycolmap.FeatureExtractionOptions,
     log_folder: Path,
     _: Progress,
 ) -> int:
-    """Find features in photos of a database, except where their masks, if there are any, are black.
-
-    Returns the number of photos. The progress is to be read from the database.
-    """
-    reader = pycolmap.ImageReaderOptions()
-    if mask_path is not None:
-        reader.mask_path = mask_path
+    """Find features in photos of a database, and return their number; the progress is to be read from the database."""
     with logging_into(log_folder):
         pycolmap.extract_features(
             database_path,

@@ -179,15 +179,13 @@ def _degrees(parts: Any, is_negative: bool) -> float:
     return (degrees + minutes / 60 + seconds / 3600) * (-1 if is_negative else 1)
 
 
-def contents_of_masks(folder: Path | None, photos: Photos) -> dict[str, str]:
-    """Return the SHA-256 of each photo's mask, by the photo's name; empty without a folder of masks.
+def contents_of_masks(folder: Path, photos: Photos) -> dict[str, str]:
+    """Return the SHA-256 of each photo's mask, by the photo's name.
 
     Raises:
         InputError: a photo has no mask, so that COLMAP would find no features in it, or has a mask of another size,
             which COLMAP would use as if it had the photo's size.
     """
-    if folder is None:
-        return {}
     if not folder.is_dir():
         raise InputError("no such folder, expected a folder of masks ([mapper] mask_path)", folder)
     masks = {name: _mask(folder, name) for name in photos.names}

@@ -90,12 +90,14 @@ class PhotoMatching:
 
     def fill(self, space: Workspace, log_folder: Path) -> None:
         """Find the features and matches that no earlier run has found, in the database of a workspace."""
-        photos, masks = self.photos, self.mapper.mask_path
+        reader = pycolmap.ImageReaderOptions()
+        if self.mapper.mask_path is not None:
+            reader.mask_path = self.mapper.mask_path
         space.run(
             "features",
             self.plan["features"],
             partial(self._begin, space),
-            lambda: extract_features(space.database, photos, self.features, log_folder, space.progress, masks),
+            lambda: extract_features(space.database, self.photos, reader, self.features, log_folder, space.progress),
         )
         space.run(
             "matching",
@@ -205,7 +207,7 @@ def photo_matching(
         progress.message("features and matching: on the GPU")
     photos = usable_photos(image_path, image_names)
     cameras = cameras_of_photos(camera, photos, rigs)
-    masks = contents_of_masks(mapper.mask_path, photos)
+    masks = {} if mapper.mask_path is None else contents_of_masks(mapper.mask_path, photos)
     if photos.left_out:
         name, reason = next(iter(photos.left_out.items()))
         num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)

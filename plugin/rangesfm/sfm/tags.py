@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,55 +28,35 @@ _GAMMA, _LEFT_AT_SIDE_PX = 2.2, 0.2
 _WINDOW, _MIN_WINDOW_PX, _MAX_WINDOW_PX = 0.75, 2, 10
 
 
-@dataclass(frozen=True)
-class FoundTags:
-    """Tags found in photos.
+def names_of_tags(markers: Iterable[str]) -> list[str]:
+    """Return the names of the tags whose corners these markers are."""
+    return list(dict.fromkeys(name.partition(".")[0] for name in markers))
 
-    Attributes:
-        markers: corners by name. ``tag7.0`` to ``tag7.3`` are those of tag 7, clockwise from the upper left corner of
-            the tag held upright.
-        num_photos: number of photos in which a tag was found.
+
+def sides_of_tags(markers: Mapping[str, Marker], side_m: float, stddev_m: float) -> tuple[TapedDistance, ...]:
+    """Return the four sides of each tag as measured lengths.
+
+    Args:
+        markers: as ``find_tags`` returns them.
+        side_m: length of a side, metres.
+        stddev_m: standard deviation of the error that all printed sides share, metres. The error that all corners found
+            in photos share is added to it.
     """
-
-    markers: dict[str, Marker]
-    num_photos: int
-
-    @property
-    def tags(self) -> list[str]:
-        """Names of the tags, without corners."""
-        return list(dict.fromkeys(name.partition(".")[0] for name in self.markers))
-
-    @property
-    def side_px(self) -> float:
-        """Median length of a side in the photos, in pixels."""
-        ends = [[self.markers[f"{tag}.{k}"].pixels for tag in self.tags] for k in (0, 1)]
-        start, end = (np.concatenate(of) for of in ends)
-        return float(np.median(np.linalg.norm(end - start, axis=1)))
-
-    def sides(self, side_m: float, stddev_m: float) -> tuple[TapedDistance, ...]:
-        """Return the four sides of each tag as measured lengths.
-
-        Args:
-            side_m: length of a side, metres.
-            stddev_m: standard deviation of the error that all printed sides share, metres. The error that all corners
-                found in photos share is added to it.
-        """
-        if not self.markers:
-            return ()
-        stddev_m = float(np.hypot(stddev_m, side_m * _LEFT_AT_SIDE_PX / self.side_px))
-        return tuple(
-            TapedDistance(
-                (f"{tag}.{k}", f"{tag}.{(k + 1) % _NUM_CORNERS}"), side_m, stddev_m, CONTROL, line=0, is_printed=True
-            )
-            for tag in self.tags
-            for k in range(_NUM_CORNERS)
-        )
+    if not markers:
+        return ()
+    tags = names_of_tags(markers)
+    start, end = (np.concatenate([markers[f"{tag}.{k}"].pixels for tag in tags]) for k in (0, 1))
+    side_px = float(np.median(np.linalg.norm(end - start, axis=1)))
+    stddev_m = float(np.hypot(stddev_m, side_m * _LEFT_AT_SIDE_PX / side_px))
+    ends = ((f"{tag}.{k}", f"{tag}.{(k + 1) % _NUM_CORNERS}") for tag in tags for k in range(_NUM_CORNERS))
+    return tuple(TapedDistance(pair, side_m, stddev_m, CONTROL, line=0, is_printed=True) for pair in ends)
 
 
-def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progress: Progress) -> FoundTags:
-    """Find the tags of an OpenCV dictionary in each photo, in pixels as stored.
+def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progress: Progress) -> dict[str, Marker]:
+    """Find the tags of an OpenCV dictionary in each photo, and return their corners by name, in pixels as stored.
 
-    A tag that appears twice in a photo is left out of that photo.
+    ``tag7.0`` to ``tag7.3`` are those of tag 7, clockwise from the upper left corner of the upright tag. A tag that
+    appears twice in a photo is left out of that photo.
 
     Raises:
         InputError: OpenCV is not installed, or a photo cannot be read.
@@ -86,7 +65,6 @@ def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progres
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
     detector, num_modules = cv2.aruco.ArucoDetector(known), known.markerSize + 2
     seen: dict[str, list[tuple[str, Any]]] = defaultdict(list)
-    photos_with_tags = set()
     for number, name in enumerate(image_names):
         progress.update(number, len(image_names))
         try:
@@ -99,14 +77,12 @@ def find_tags(folder: Path, image_names: Sequence[str], dictionary: str, progres
         times = Counter(numbers)
         for tag, quad in zip(numbers, corners, strict=True):
             if times[tag] == 1:
-                photos_with_tags.add(name)
                 for k, at in enumerate(_refined(cv2, pixels, np.reshape(quad, (_NUM_CORNERS, 2)), num_modules)):
                     seen[f"tag{tag}.{k}"].append((name, at + _CENTRE_PX))
-    markers = {
+    return {
         corner: Marker(tuple(names), np.array(places, dtype=np.float64), (0,) * len(names), FOUND_STDDEV_PX)
         for corner, (names, places) in sorted((corner, tuple(zip(*of))) for corner, of in seen.items())
     }
-    return FoundTags(markers, len(photos_with_tags))
 
 
 def _refined(cv2: Any, pixels: npt.NDArray[np.uint8], quad: Array, num_modules: int) -> Array:

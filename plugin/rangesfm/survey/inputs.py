@@ -129,8 +129,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             survey.anchors.path,
         )
     if frame != "unknown":
-        _check_anchors_differ(log, anchors, survey.anchors.path)
-        _check_unit_of_anchors(log, anchors, survey.anchors.path)
+        _check_anchors_differ(log, anchors, survey)
+        _check_unit_of_anchors(log, anchors, survey)
     _check_held_out(survey, anchors, frame)
     curve_path, curve_notes = survey.ranges.error_curve, list[str]()
     if curve_path is not None:
@@ -245,7 +245,7 @@ def read_log(
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
     *,
-    files: Sequence[str] | None = None,
+    files: Sequence[str] = (),
 ) -> RangeLog:
     """Read the radio's log as a survey describes it; see ``read_ranges``.
 
@@ -253,7 +253,7 @@ def read_log(
         options: of the log.
         anchor_ids: ids that are known to be anchors.
         tag_ids: ids that are known to be tags.
-        files: to read in place of ``options.path``; None: that path.
+        files: to read in place of ``options.path``; empty: that path.
 
     Raises:
         InputError: there is no log, or it cannot be read.
@@ -302,7 +302,7 @@ def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
     return arms
 
 
-def _check_anchors_differ(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
+def _check_anchors_differ(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> None:
     """Check that the positions of a log's anchors are not all alike, as in a table that was never filled in.
 
     Raises:
@@ -313,11 +313,11 @@ def _check_anchors_differ(log: RangeLog, anchors: Sequence[Anchor], path: Path |
         raise InputError(
             f"all {len(positions_m)} anchors of the log have the same coordinates, expected those that were measured, "
             "or empty cells",
-            path,
+            survey.anchors.path,
         )
 
 
-def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
+def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> None:
     """Check that the positions of anchors are in metres.
 
     The distance between two anchors is at most the sum of the ranges to them, if the camera hardly moves between these.
@@ -346,9 +346,8 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path 
         ids = " and ".join(log.anchor_ids[log.anchor_index[row]] for row in rows)
         ranges_m = " and ".join(f"{log.range_m[row]:.3g}" for row in rows)
         message = f"anchors {ids} are {apart_m[shown]:.6g} m apart here, and the ranges to them {ranges_m} m"
-        raise InputError(
-            f"{message}: are the positions in {unit}? expected metres, or their unit (--anchor_unit)", path
-        )
+        asked = f"are the positions in {unit}? expected metres, or their unit (--anchor_unit)"
+        raise InputError(f"{message}: {asked}", survey.anchors.path)
 
 
 def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:

@@ -72,7 +72,7 @@ def take_photos(
     if earlier is not None:
         progress.message("photos: taken over from an earlier run")
         return earlier
-    wanted = TakenPhotos(files=_files(path, None), rate_hz=rate_hz, topic=topic)
+    wanted = TakenPhotos(files=_files(path, {}), rate_hz=rate_hz, topic=topic)
     progress.stage("photos")
     source = open_source(path, topic)
     with new_folder(folder) as new:
@@ -96,7 +96,7 @@ def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str) -> T
         earlier = TakenPhotos.read(folder / RECORD_NAME)
     except InputError:
         return None
-    wanted = TakenPhotos(files=_files(path, earlier), rate_hz=rate_hz, topic=topic)
+    wanted = TakenPhotos(files=_files(path, earlier.files), rate_hz=rate_hz, topic=topic)
     return earlier if wanted.choice == earlier.choice and earlier.are_in(folder) else None
 
 
@@ -133,8 +133,7 @@ def _write(source: PhotoSource, folder: Path, rate_hz: float, progress: Progress
     return times_s, num_bytes
 
 
-def _files(path: Path, earlier: TakenPhotos | None) -> _Files:
-    """Return state and SHA-256 by name of a file, or of all files in a folder. Hashes of unchanged files are reused."""
+def _files(path: Path, known: _Files) -> _Files:
+    """Return state and SHA-256 by name of a file, or of all files in a folder; those known of unchanged files."""
     files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
-    known = {} if earlier is None else earlier.files
     return {file.name: state_and_sha256(file, known.get(file.name)) for file in files}

@@ -64,7 +64,7 @@ class RangeColumns:
     required: Mapping[str, str]
     optional: Mapping[str, str] = field(default_factory=dict)
     wide: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    anchor_id: str | None = None
+    anchor_id: str = ""
     layout: Layout | None = None
     is_strict: bool = False
     notes: tuple[str, ...] = ()
@@ -147,7 +147,7 @@ def _anchors(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -
     """Return the anchor of each range, row by row: the same in each row, or from a column."""
     if not columns.wide:
         if "anchor_id" not in name:
-            return _repeated([columns.anchor_id or ""], len(table))
+            return _repeated([columns.anchor_id], len(table))
         return _ids(table, name["anchor_id"], columns, None)
     each = [
         _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))

@@ -39,7 +39,7 @@ class Guess:
         notes: lines for the user about what was found.
         doubts: why the guess is not sure; empty if it is.
         missing: quantities for which no column was found.
-        span: ``wide`` in short, if its columns have no names: quantity and columns.
+        wide_in_short: ``wide`` as the user would give it, if its columns have no names: quantity and columns.
     """
 
     columns: dict[str, str] = field(default_factory=dict)
@@ -48,14 +48,14 @@ class Guess:
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
-    span: tuple[str, str] | None = None
+    wide_in_short: dict[str, str] = field(default_factory=dict)
 
     @property
     def told(self) -> dict[str, str]:
         """The guess in the form in which the user would give the columns."""
         wide = {f"range:{anchor}" + f":{tag}" * bool(tag): name for name, (anchor, tag) in self.wide.items()}
         columns = dict(sorted(self.columns.items(), key=lambda item: item[0] != "timestamp"))
-        return {**columns, **(dict([self.span]) if self.span else wide)}
+        return {**columns, **(self.wide_in_short or wide)}
 
 
 def guess_columns(layout: Layout) -> Guess:
@@ -440,7 +440,7 @@ def _wide_by_values(columns: list[ColumnSample], guess: Guess) -> None:
     guess.wide = dict(zip(names, ids))
     if are_numbered and int(names[-1]) - int(names[0]) == len(names) - 1:
         of_tags = f":T0-T{num_tags - 1}" * (num_tags > 1)
-        guess.span = (f"range:0-{num - 1}{of_tags}", f"{names[0]}-{names[-1]}")
+        guess.wide_in_short = {f"range:0-{num - 1}{of_tags}": f"{names[0]}-{names[-1]}"}
     tags = f", each for {num_tags} tags, whose ranges are nearly the same" if num_tags > 1 else ""
     guess.doubts.append(f"columns {names[0]} to {names[-1]} may be ranges to {num} anchors{tags}")
 

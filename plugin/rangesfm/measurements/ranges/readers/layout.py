@@ -110,6 +110,9 @@ class Cure:
         return number.replace(",", ".") if self.commas and _DECIMAL_COMMA.fullmatch(number) else number
 
 
+NO_CURE = Cure()
+
+
 @dataclass(frozen=True)
 class ColumnSample:
     """A column with its name and its first cells.
@@ -118,13 +121,13 @@ class ColumnSample:
         name: name of the column.
         cells: its first cells.
         unit: unit after each of its numbers, "" if there is none.
-        cure: conversion of its cells, which has been applied to ``cells``; None if none is needed.
+        cure: conversion of its cells, which has been applied to ``cells``.
     """
 
     name: str
     cells: tuple[str, ...]
     unit: str = ""
-    cure: Cure | None = None
+    cure: Cure = NO_CURE
 
     @cached_property
     def words(self) -> list[str]:
@@ -181,7 +184,7 @@ class ColumnSample:
         cells = [*map(cure, self.filled)]
         apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
         cure = replace(cure, thousands=next(apart, ""), commas=any(map(_DECIMAL_COMMA.fullmatch, cells)))
-        return self if cure == Cure() else self._with(cure)
+        return self if cure == NO_CURE else self._with(cure)
 
     def _with(self, cure: Cure) -> ColumnSample:
         return replace(self, cells=tuple(map(cure, self.cells)), unit=cure.unit, cure=cure)
@@ -224,7 +227,7 @@ class Layout:
             InputError: lines are not rows of the table.
         """
         table, notes = self.read_cells(every_row)
-        cures = {column.name: column.cure for column in self.columns if column.cure}
+        cures = {column.name: column.cure for column in self.columns if column.cure != NO_CURE}
         cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
         notes += ["numbers have decimal commas"] if any(cure.commas for cure in cures.values()) else []
         return replace(table, cells={**table.cells, **cured}), notes

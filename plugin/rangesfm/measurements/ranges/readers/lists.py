@@ -19,7 +19,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import MISSING, ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import MISSING, NO_CURE, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE, named_length_unit
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.text_tables import FOUND, NO_NAMES, TextTable, read_head, read_table
@@ -226,9 +226,9 @@ def read_rows(
     """
     table, notes = layout.read(every_row=True)
     # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
-    uncured = [column for column in layout.columns if column.name in columns.values() and column.cure is None]
+    uncured = [column for column in layout.columns if column.name in columns.values() and column.cure == NO_CURE]
     cured = {column.name: column.cured().cure for column in uncured}
-    cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cured.items() if cure}
+    cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cured.items() if cure != NO_CURE}
     taken = ", ".join(f"{quantity} = {name}" for quantity, name in columns.items())
     unused = [name for name in layout.units if name not in columns.values()]
     notes.insert(0, f"columns taken: {taken}" + (f"; not used: {printable(', '.join(unused))}" if unused else ""))

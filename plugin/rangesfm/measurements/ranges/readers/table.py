@@ -76,14 +76,12 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
             command to type.
     """
     layout = find_layout(path, options.separator)
-    guess = None if layout is None else guess_columns(layout)
-    if (
-        layout is None
-        or guess is None
-        or guess.missing
-        or guess.doubts
-        or (not layout.has_names and _is_trajectory(layout))
-    ):
+    if layout is None:
+        _refuse_other_logs(path, _NO_RANGES)
+        first_line = printable(read_head(path).strip().split("\n")[0])
+        raise InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
+    guess = guess_columns(layout)
+    if guess.missing or guess.doubts or (not layout.has_names and _is_trajectory(layout)):
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
     columns = RangeColumns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
@@ -107,16 +105,21 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
         yield f"no column gives the anchor: it is named '{_anchor_of_file(path)}' after the file"
 
 
-def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
-    if layout is not None and _is_trajectory(layout):
-        return InputError("holds poses over time (a trajectory) and no ranges", path)
+def _refuse_other_logs(path: Path, known: Iterable[tuple[re.Pattern[str], str]]) -> None:
+    """Raise InputError for a log that holds something else than ranges.
+
+    Args:
+        known: patterns of such logs, and what they hold.
+    """
     head = read_head(path)
-    reasons = _NO_RANGES if guess is None or "range" in guess.missing else _NO_RANGES[:1]
-    if instead := next((what for pattern, what in reasons if pattern.search(head)), None):
-        return InputError(f"the log {instead}", path)
-    if layout is None or guess is None:
-        first_line = printable(head.strip().split("\n")[0])
-        return InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
+    if instead := next((what for pattern, what in known if pattern.search(head)), None):
+        raise InputError(f"the log {instead}", path)
+
+
+def _question(path: Path, options: ReadOptions, layout: Layout, guess: Guess) -> InputError:
+    if _is_trajectory(layout):
+        return InputError("holds poses over time (a trajectory) and no ranges", path)
+    _refuse_other_logs(path, _NO_RANGES if "range" in guess.missing else _NO_RANGES[:1])
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
     why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
