@@ -142,8 +142,9 @@ def _told(error: BaseException) -> tuple[str, int]:
         return str(error), error.exit_status
     if any(isinstance(cause, KeyboardInterrupt) for cause in _with_causes(error)):
         return "interrupted; stages that were done are kept", INTERRUPTED
-    if any(map(_is_want_of_memory, _with_causes(error))):
-        return "out of memory", FAILED
+    for cause in _with_causes(error):
+        if isinstance(cause, MemoryError) or any(words in str(cause).lower() for words in _WANT_OF_MEMORY):
+            return "out of memory", FAILED
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{error.strerror or error}", BAD_INPUT if error.errno in _UNUSABLE_PATH else FAILED
@@ -156,7 +157,3 @@ def _with_causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
-
-
-def _is_want_of_memory(error: BaseException) -> bool:
-    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _WANT_OF_MEMORY)

@@ -82,6 +82,6 @@ def test_colmap_is_told_the_device_beside_the_options_which_it_would_not_heed_al
         monkeypatch.setattr(pycolmap, name, lambda *_, device, **__: told.append(device))
     for_features = pycolmap.FeatureExtractionOptions(use_gpu=on_gpu)
     matcher = pycolmap.FeatureMatchingOptions(use_gpu=on_gpu)
-    find_features(tmp_path / "1.db", tmp_path, ["1.jpg"], pycolmap.ImageReaderOptions(), for_features, tmp_path, SILENT)
+    find_features(tmp_path / "1.db", tmp_path, ["1.jpg"], None, for_features, tmp_path, SILENT)
     match_share(tmp_path / "1.db", [(1, 2)], matcher, pycolmap.TwoViewGeometryOptions(), tmp_path, SILENT)
     assert told == [pycolmap.Device.cuda if on_gpu else pycolmap.Device.cpu] * 2

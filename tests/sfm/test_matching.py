@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pycolmap
 import pytest
 from tests.sfm.matches import content_of
 
@@ -37,9 +36,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}))
-    extract_features(
-        room.folder / "database.db", photos, pycolmap.ImageReaderOptions(), options, room.folder, Progress()
-    )
+    extract_features(room.folder / "database.db", photos, options, room.folder, Progress())
     return photos
 
 

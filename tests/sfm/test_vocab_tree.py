@@ -45,7 +45,7 @@ def database(room: Room) -> Path:
     path = room.folder / "alike.db"
     create_database(path, room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}}))
-    extract_features(path, photos, pycolmap.ImageReaderOptions(), options, path.parent, Progress())
+    extract_features(path, photos, options, path.parent, Progress())
     return path
 
 

@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.getcwd()
         except FileNotFoundError:
             raise InputError("the working folder has been deleted: change to one that exists") from None
-        _require_address_space()
+        mmap.mmap(-1, _NEEDED_ADDRESS_SPACE).close()  # an OSError here, not a crash or a library that waits for ever
         settle_num_threads()
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
@@ -67,11 +67,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         except OSError:  # the exit status says enough
             discard_output(sys.stderr)
         return failure.exit_status
-
-
-def _require_address_space() -> None:
-    """Raise OSError if the libraries cannot be loaded: with too little address space, some crash or wait for ever."""
-    mmap.mmap(-1, _NEEDED_ADDRESS_SPACE).close()
 
 
 def _open_closed_streams() -> None:

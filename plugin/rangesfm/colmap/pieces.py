@@ -12,7 +12,7 @@ import pycolmap
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices
 
 # COLMAP takes two photos for a pair if this many matches agree on their geometry (min_num_inliers).
 MIN_NUM_SHARED = 15
@@ -64,7 +64,7 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
     return tuple(
         LoosePiece(
             tuple(sorted(name for k in np.flatnonzero(labels == part) for name in names[k])),
-            _shared_with_rest(sees, labels == part),
+            int(_shared_by_parts(sees, (labels == part).astype(np.int64))[0, 1]),
         )
         for part in np.flatnonzero(num_frames > 1).tolist()
         if part != largest
@@ -94,7 +94,10 @@ def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]
     labels = np.arange(len(frame_ids))
     while True:
         num_before = int(labels.max()) + 1
-        num, merged = connected_components(_held_together(_shared_by_parts(sees, labels)), directed=False)
+        shared = _shared_by_parts(sees, labels)
+        shared.data[shared.data < MIN_NUM_SHARED] = 0
+        shared.eliminate_zeros()
+        num, merged = connected_components(shared, directed=False)
         labels = merged[labels]
         if num == num_before:
             return frame_ids, sees, labels
@@ -115,27 +118,10 @@ def _frames_see(model: pycolmap.Reconstruction, frame_ids: Indices) -> csr_array
 
 def _shared_by_parts(sees: csr_array, labels: Indices) -> csr_array:
     """Return the sparse matrix (k, k) of the numbers of points that pairs of k parts both see."""
-    by_part = _sum_by_part(sees, labels)
-    return csr_array(by_part @ by_part.T)
-
-
-def _held_together(shared: csr_array) -> csr_array:
-    """Return the pairs of parts that share enough points, as a sparse matrix of ones."""
-    pairs = shared.tocoo()
-    enough = pairs.data >= MIN_NUM_SHARED
-    return csr_array(coo_array((pairs.data[enough], (pairs.row[enough], pairs.col[enough])), shape=shared.shape))
-
-
-def _sum_by_part(sees: csr_array, labels: Indices) -> csr_array:
-    """Return the sparse matrix (k, p) with a 1 where some frame of a part sees a point."""
     of_part = coo_array((np.ones(len(labels)), (labels, np.arange(len(labels)))))
     by_part = csr_array(of_part.tocsr() @ sees)
-    by_part.data[:] = 1.0
-    return by_part
-
-
-def _shared_with_rest(sees: csr_array, is_in_part: Mask) -> int:
-    return int(_shared_by_parts(sees, is_in_part.astype(np.int64))[0, 1])
+    by_part.data[:] = 1.0  # where some frame of a part sees a point
+    return csr_array(by_part @ by_part.T)
 
 
 def _names_of_frames(model: pycolmap.Reconstruction, frame_ids: Indices) -> list[list[str]]:

@@ -33,7 +33,10 @@ def read_exif_positions(folder: Path) -> PositionLog:
         InputError: no photo has a position.
     """
     found = {name: data for name in list_images(folder) if (data := gps_data(folder / name)) is not None}
-    found = {name: data for name, data in found.items() if _is_fixed(data)}
+    # Some receivers write zeros where they do not know where they are.
+    found = {
+        name: data for name, data in found.items() if data.tags.get(_STATUS) != _VOID and data.degrees != (0.0, 0.0)
+    }
     at = {
         name: [*data.degrees[::-1], data.altitude_m] for name, data in found.items() if math.isfinite(data.altitude_m)
     }
@@ -51,11 +54,6 @@ def read_exif_positions(folder: Path) -> PositionLog:
         notes=[flat] if len(at) < len(found) else [],
     )
     return replace(log, crs=GEOGRAPHIC)
-
-
-def _is_fixed(data: GpsData) -> bool:
-    """Return whether the receiver knew where it was; some write zeros where it did not."""
-    return data.tags.get(_STATUS) != _VOID and data.degrees != (0.0, 0.0)
 
 
 def _stddevs_m(data: GpsData) -> Array:

@@ -38,16 +38,16 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
 def extract_features(
     database_path: Path,
     photos: Photos,
-    reader: pycolmap.ImageReaderOptions,
     options: pycolmap.FeatureExtractionOptions,
     log_folder: Path,
     progress: Progress,
+    mask_path: Path | None = None,
 ) -> None:
     """Find features in the photos of the database that have none yet, except where their masks are black.
 
     Args:
-        reader: with the folder of the masks, if there are any.
         log_folder: folder for COLMAP's messages.
+        mask_path: folder of the masks.
 
     Raises:
         ReconstructionError: fewer than two photos have enough features, or COLMAP failed.
@@ -59,7 +59,7 @@ def extract_features(
 
         missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
         if missing:
-            work = partial(find_features, database_path, photos.folder, missing, reader, options, log_folder)
+            work = partial(find_features, database_path, photos.folder, missing, mask_path, options, log_folder)
             run_child(work, say_how_many)
         say_how_many(0)
         ids = enumerate(photos.names, 1)

@@ -207,7 +207,10 @@ def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:
     Raises:
         InputError: at most half of the photos have a time.
     """
-    exifs = {name: _read_exif(Path(folder) / name) for name in names}
+    exifs = {
+        name: {tag: text.strip("\0 ") for tag, text in exif_tags(Path(folder) / name).items() if isinstance(text, str)}
+        for name in names
+    }
     offsets = [_utc_offset(exif) for exif in exifs.values()]
     offset = next((known for known in offsets if known is not None), timedelta(0))
     stamps = {name: stamp for name, exif in exifs.items() if (stamp := _exif_stamp(exif, offset)) is not None}
@@ -283,11 +286,6 @@ def _of_most(
 def _resolution(text: str) -> float:
     """Return the value of one unit in the last decimal place of a number as written."""
     return float(10.0 ** -len(text.partition(".")[2]))
-
-
-def _read_exif(path: Path) -> dict[int, str]:
-    """Return the EXIF tags that hold text, by number; empty if the file has none or is not an image."""
-    return {tag: value.strip("\0 ") for tag, value in exif_tags(path).items() if isinstance(value, str)}
 
 
 def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | None:

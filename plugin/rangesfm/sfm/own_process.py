@@ -28,12 +28,18 @@ def find_features(
     database_path: Path,
     image_path: Path,
     image_names: Sequence[str],
-    reader: pycolmap.ImageReaderOptions,
+    mask_path: Path | None,
     options: pycolmap.FeatureExtractionOptions,
     log_folder: Path,
     _: Progress,
 ) -> int:
-    """Find features in photos of a database, and return their number; the progress is to be read from the database."""
+    """Find features in photos of a database, except where their masks, if there are any, are black.
+
+    Returns the number of photos. The progress is to be read from the database.
+    """
+    reader = pycolmap.ImageReaderOptions()
+    if mask_path is not None:
+        reader.mask_path = mask_path
     with logging_into(log_folder):
         pycolmap.extract_features(
             database_path,

@@ -188,7 +188,11 @@ def contents_of_masks(folder: Path, photos: Photos) -> dict[str, str]:
     """
     if not folder.is_dir():
         raise InputError("no such folder, expected a folder of masks ([mapper] mask_path)", folder)
-    masks = {name: _mask(folder, name) for name in photos.names}
+    # COLMAP's rule: the mask of a.png is a.png.png, or else a.png.
+    masks = {name: folder / f"{name}.png" for name in photos.names}
+    masks |= {
+        name: folder / name for name, mask in masks.items() if not mask.is_file() and name.lower().endswith(".png")
+    }
     if missing := [name for name, mask in masks.items() if not mask.is_file()]:
         raise InputError(
             f"{len(missing)} of {len(masks)} photos have no mask in this folder, the first is {missing[0]}: expected"
@@ -200,9 +204,3 @@ def contents_of_masks(folder: Path, photos: Photos) -> dict[str, str]:
             what = "cannot be read as an image" if found is None else f"has {found[0]} x {found[1]} pixels"
             raise InputError(f"{what}, expected {size[0]} x {size[1]} like the photo {name}", masks[name])
     return {name: sha256_of(mask) for name, mask in masks.items()}
-
-
-def _mask(folder: Path, name: str) -> Path:
-    """Return the mask's path by COLMAP's rule: the mask of a.png is a.png.png, or else a.png."""
-    mask = folder / f"{name}.png"
-    return folder / name if not mask.is_file() and name.lower().endswith(".png") else mask

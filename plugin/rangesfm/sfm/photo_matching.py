@@ -90,14 +90,12 @@ class PhotoMatching:
 
     def fill(self, space: Workspace, log_folder: Path) -> None:
         """Find the features and matches that no earlier run has found, in the database of a workspace."""
-        reader = pycolmap.ImageReaderOptions()
-        if self.mapper.mask_path is not None:
-            reader.mask_path = self.mapper.mask_path
+        photos, masks = self.photos, self.mapper.mask_path
         space.run(
             "features",
             self.plan["features"],
             partial(self._begin, space),
-            lambda: extract_features(space.database, self.photos, reader, self.features, log_folder, space.progress),
+            lambda: extract_features(space.database, photos, self.features, log_folder, space.progress, masks),
         )
         space.run(
             "matching",

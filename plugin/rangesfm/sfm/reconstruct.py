@@ -116,6 +116,11 @@ def reconstruct_in(
             def options(rigs: Rigs) -> MappingOptions:
                 return mapping_options(camera, mapper, rigs, seed, space.database)
 
+            def begin_mapping() -> None:
+                """Remove old models, and the matches of the loops that were found by them."""
+                space.remove_old_models()
+                forget_loops(space, with_matches=True)
+
             matching.fill(space, log_folder)
             if placing:
                 space.run(
@@ -127,7 +132,7 @@ def reconstruct_in(
             space.run(
                 "mapping",
                 mapping,
-                lambda: _begin_mapping(space),
+                begin_mapping,
                 lambda: map_photos(space, matching.photos, options(rigs), log_folder),
             )
     found = read_mapped_models(space.models)
@@ -142,12 +147,6 @@ def reconstruct_in(
         space.earlier_seconds,
         unpublished.log_path,
     )
-
-
-def _begin_mapping(space: Workspace) -> None:
-    """Remove old models, and the matches of the loops that were found by them."""
-    space.remove_old_models()
-    forget_loops(space, with_matches=True)
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions, log_folder: Path) -> None:

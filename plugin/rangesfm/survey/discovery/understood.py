@@ -137,7 +137,12 @@ def _tell_points_from_anchors(found: Found, values: Mapping[str, Any]) -> None:
     They are positions if they are named like the photos.
     """
     has_log = LOG in {*values, *found.paths}
-    photos = {Path(name).stem.lower() for folder in found.paths.get(PHOTOS, []) for name in _names_of_photos(folder)}
+    photos = {
+        Path(name).stem.lower()
+        for folder in found.paths.get(PHOTOS, [])
+        if not is_source(folder)
+        for name in list_images(folder)
+    }
     marks = {name for path in found.paths.get("scale.markers", []) for name in _names_of_marks(path)}
     for path in found.paths.pop(ANCHORS, []):
         ids: set[str] = set()
@@ -157,10 +162,6 @@ def _tell_points_from_anchors(found: Found, values: Mapping[str, Any]) -> None:
         else:
             as_points = error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"})
             found.unclear.setdefault(POINTS, []).append(as_points)
-
-
-def _names_of_photos(folder: Path) -> Sequence[str]:
-    return () if is_source(folder) else list_images(folder)
 
 
 def _names_of_marks(path: Path) -> Iterator[str]:

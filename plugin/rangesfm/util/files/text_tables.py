@@ -202,13 +202,11 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]
         plain = csv.writer(file, lineterminator="\n")
         quoted = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_ALL)
         for row in (header, *rows):
-            cells = [_marked(cell) if cell[:1] in _MAY_BEGIN_FORMULA else cell for cell in row]
+            cells = [
+                f"'{cell}" if cell[:1] in _MAY_BEGIN_FORMULA and _FORMULA.match(cell) and not is_number(cell) else cell
+                for cell in row
+            ]
             (plain if _has_content(cells[0]) else quoted).writerow(cells)
-
-
-def _marked(cell: str) -> str:
-    """Return a cell as it is written: with an apostrophe in front if a spreadsheet would take it for a formula."""
-    return f"'{cell}" if _FORMULA.match(cell) and _number(cell) is None else cell
 
 
 def _without_mark(cell: str) -> str:

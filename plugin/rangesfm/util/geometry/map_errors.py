@@ -104,7 +104,8 @@ class MapErrors:
             (3 k, 3 k) covariance of their coordinates.
         """
         covariance: Array = block_diag(*(point.own_m2 for point in points))
-        by_mode, by_scale = np.zeros((len(covariance), self._num_modes)), np.zeros(len(covariance))
+        num_modes = next(iter(self.parts.values())).modes.shape[2]
+        by_mode, by_scale = np.zeros((len(covariance), num_modes)), np.zeros(len(covariance))
         for part in dict.fromkeys(part for point in points for part in point.by_part):
             (kind, id_) = part
             errors = self.parts[kind]
@@ -116,7 +117,3 @@ class MapErrors:
             covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
         covariance = covariance + by_mode @ by_mode.T
         return np.asarray(covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale))
-
-    @property
-    def _num_modes(self) -> int:
-        return int(next(iter(self.parts.values())).modes.shape[2])

@@ -378,15 +378,12 @@ def _before_position(free: list[ColumnSample]) -> list[ColumnSample]:
 
 def _pairs_by_values(free: Sequence[ColumnSample]) -> list[tuple[ColumnSample, ColumnSample]]:
     """Return the longest series of equally spaced pairs of a column of ids and a column of decimals after it."""
-    at = [k for k, (node, value) in enumerate(pairwise(free)) if _is_id(node) and _is_real(value)]
+    are_real = [one.kind == "numbers" and not one.is_whole and _is_positive(one) for one in free]
+    at = [k for k, node in enumerate(free[:-1]) if _is_id(node) and are_real[k + 1]]
     run: list[int] = []
     for first, step in product(at, {*np.diff(at).tolist()}):
         run = max(run, list(takewhile(at.__contains__, count(first, step))), key=len)
     return [(free[k], free[k + 1]) for k in run]
-
-
-def _is_real(column: ColumnSample) -> bool:
-    return column.kind == "numbers" and not column.is_whole and _is_positive(column)
 
 
 def _is_nanoseconds(column: ColumnSample) -> bool:
