@@ -62,7 +62,6 @@ class Commands(Parser):
         Args:
             name: of the command; it may have two words.
             execute: function that runs it. Its docstring is the description and the example in the help.
-            help: one line for the list of commands.
             is_common: whether most people need it; the others are in a list of their own, in the full help only.
         """
         description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")

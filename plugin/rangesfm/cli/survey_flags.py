@@ -43,7 +43,6 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
     """Add flags for keys of a survey file; ``overrides_from_arguments`` returns their values.
 
     Args:
-        parser: of the command.
         keys: dotted keys of a survey file, or names of tables for all of their keys; none: all keys there are.
         without: keys that get no flag here.
         by_own_names: whether the flags have the names of the keys, for a command that is about one table.
@@ -218,10 +217,6 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
 
     It is the survey file, if there is one, with the given flags in place of its keys. For a folder without a survey
     file, it is what ``understand`` makes of the folder.
-
-    Args:
-        args: of the command.
-        progress: is told the notes on a folder.
 
     Raises:
         InputError: the file cannot be read, or a key or a flag is wrong.

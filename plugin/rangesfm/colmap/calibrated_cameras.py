@@ -36,7 +36,6 @@ def colmap_camera(
     Args:
         distortion: the distortion model's name in Kalibr or ROS.
         pinhole: fx, fy, cx, cy in pixels, in OpenCV's convention.
-        coefficients: of the distortion.
         path: the file that they are from, for messages.
 
     Raises:

@@ -55,8 +55,6 @@ class Records:
     """n records of a binary file, each a head and then groups of fields; all groups of a file have one length.
 
     Attributes:
-        path: the file.
-        data: its content.
         start, groups_start, end: n byte offsets in ``data``, where each record, its groups and its end are.
     """
 

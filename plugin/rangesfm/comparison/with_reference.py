@@ -119,7 +119,7 @@ def _in_frame(
 def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str | None) -> ComparisonRow:
     known, target, world_from_cam = known_keyframes(path, reference)
     if len(known) == 0:
-        raise InputError(reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s))
+        raise InputError(reference.why_nothing_is_known("keyframes", reference.keys_of(path)))
     source = path.centers[known]
     in_frame = _in_frame(path, known, target, world_from_cam, frame)
     found = similarity_onto(source, target)

@@ -85,7 +85,6 @@ class SimulatedRanges:
     """n simulated ranges with their true values, in the order of the log.
 
     Attributes:
-        log: the log that the radio gives.
         image_time_s: (n,) time of each range on the camera's clock.
         distance_m: (n,) true distance between the antennas.
         is_obstructed: (n,) whether a range had no line of sight.
@@ -109,7 +108,6 @@ def simulate_ranges(
     Args:
         anchors_m: position (3,) of each anchor in the world, by id, metres.
         tag_in_cam_m: (3,) lever arm of the tag in the camera frame, metres.
-        seed: seed of noise, obstruction and loss.
     """
     num_rounds = int((path.end_s - path.start_s) * radio.rate_hz)
     turn = np.arange(num_rounds * len(anchors_m))
@@ -133,7 +131,6 @@ def measure_ranges(
         tags_m: (n, 3) positions of the moving antenna in the world, metres.
         anchor_index: (n,) index of each distance's anchor in ``anchors_m``.
         anchors_m: position (3,) of each anchor in the world, by id, metres.
-        seed: seed of noise, obstruction and loss.
     """
     rng = np.random.default_rng(seed)
     ids = np.array(list(anchors_m))

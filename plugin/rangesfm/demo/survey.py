@@ -186,7 +186,6 @@ def simulate_phone(times_s: Array, centers_m: Array, world_from_cam: Array, seed
 
     Args:
         times_s: (n,) on the camera's clock. centers_m: (n, 3) in a world whose z is up. world_from_cam: (n, 3, 3).
-        seed: seed of the sensor's errors.
     """
     camera = CameraPath.through(times_s - times_s[0], centers_m, world_from_cam)
     motion = OnCamera(camera, CAM_FROM_IMU, np.array(IMU_IN_CAM_M))

@@ -59,7 +59,7 @@ def check_times(run: SurveyRun, path: Trajectory) -> None:
     """
     reference, offset_s = run.inputs.reference, run.survey.ranges.time_offset_s
     if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
-        why = reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s)
+        why = reference.why_nothing_is_known("keyframes", reference.keys_of(path))
         raise InputError(why, run.survey.report.reference)
     if run.inputs.log.image_name is not None or offset_s is not None:
         run.ranges_on(path, offset_s or 0.0)

@@ -46,7 +46,6 @@ def extract_features(
     """Find features in the photos of the database that have none yet, except where their masks are black.
 
     Args:
-        log_folder: folder for COLMAP's messages.
         mask_path: folder of the masks.
 
     Raises:

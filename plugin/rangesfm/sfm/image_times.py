@@ -137,7 +137,6 @@ def times_at_rate(names: Sequence[str], rate_hz: float) -> ImageTimes:
 
     Args:
         names: all photos that were taken; the order is that of the numbers in their names.
-        rate_hz: photos per second.
     """
     ordered = sorted(names, key=natural_order)
     note = f"image times are by the given rate of {rate_hz:g} photos a second, from {ordered[0]} to {ordered[-1]}"
@@ -157,7 +156,6 @@ def read_image_times_csv(
     Where photos are known, names in the table are matched with them by ``photos_meant``.
 
     Args:
-        path: the file; other columns are ignored.
         names: the existing photos; None: the names in the file are not checked.
         frames: groups of photos taken at once, each by the name of the photo among ``names`` that stands for it and
             belongs to it. A group gets the time of its first photo that has one.

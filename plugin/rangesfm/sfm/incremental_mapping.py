@@ -76,7 +76,6 @@ def incremental_mapping(
     COLMAP's parts do not release Python's global lock, so that other threads run only during the callbacks.
 
     Args:
-        unfinished: a mapping to continue.
         callback: called when a model has its initial pair or is continued, and after each further photo.
         cancellation_token: ends the mapping after the current photo, as does ``options.max_runtime_seconds``.
     """

@@ -21,9 +21,6 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: ImageOptions) 
     Every n-th photo is taken. Of these, those at least ``min_interval_s`` apart are kept. If these are more than
     ``max_num_keyframes``, so many are taken, evenly spaced. The first photo is always a keyframe.
 
-    Args:
-        photos: photos with times, or names alone.
-
     Raises:
         InputError: fewer than three keyframes are left, or a least interval is set for photos without times.
     """

@@ -61,7 +61,6 @@ class LoopMatching(Workspace):
 
     Args:
         source: the database. An interrupted run may have copied the same one and added matches to it.
-        options: of the matching.
     """
 
     def __init__(self, source: Path, options: MatchingOptions, progress: Progress, output: OutputFolder):

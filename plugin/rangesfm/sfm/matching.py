@@ -43,10 +43,8 @@ class MatchingOptions:
 
     Attributes:
         pairing: which pairs are matched.
-        matcher: options of the matching itself.
         verification: options of the geometric verification of matches.
         verifier: options of the verification where the matches are given.
-        num_processes: processes that match at the same time.
     """
 
     pairing: PairingOptions | NamedPairs
@@ -106,9 +104,6 @@ def match_features(
     database_path: Path, photos: Photos, options: MatchingOptions, log_folder: Path, progress: Progress
 ) -> None:
     """Match the pairs of photos that have not been matched yet; the number of processes does not change the result.
-
-    Args:
-        log_folder: folder for COLMAP's messages.
 
     Raises:
         ReconstructionError: no two photos match.

@@ -31,7 +31,6 @@ class Photos:
     """Photos of one folder, of any sizes.
 
     Attributes:
-        folder: the folder.
         names: n names, relative to the folder, in the order given.
         sizes: n pairs of width and height in pixels, as stored; EXIF orientation is ignored, as in COLMAP.
         left_out: for each photo that cannot be used, by name, the reason.

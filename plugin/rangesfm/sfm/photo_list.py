@@ -44,7 +44,6 @@ def read_photo_list(
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
     Args:
-        path: the file; other columns are ignored.
         columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; empty:
             recognized.
         unit: unit of the times as in [ranges] timestamp_unit; None: by the column's name or the values.

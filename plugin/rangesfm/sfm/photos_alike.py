@@ -30,11 +30,9 @@ def pairs_alike(
     """Return pairs of photos that look alike, as ids, smaller first.
 
     Args:
-        database_path: with the photos' descriptors.
         known: ids of the photos, with those of the photos that each one is not to be paired with.
         log: the messages of COLMAP and of its parts are appended to this file.
         max_num: largest number of pairs that one photo proposes.
-        seed: of the vocabulary.
     """
     with scratch_folder(database_path.with_name("vocabulary")) as folder, colmap_log(log):
         path = folder / "words.bin"

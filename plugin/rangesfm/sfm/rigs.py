@@ -30,7 +30,6 @@ class Rigs:
 
     Attributes:
         configs: COLMAP's rig configurations in the order of the file, with lengths in metres.
-        path: the configuration file.
     """
 
     configs: tuple[pycolmap.RigConfig, ...] = ()
@@ -207,11 +206,7 @@ def _is_placed_alike(camera: pycolmap.RigConfigCamera, other: pycolmap.RigConfig
 
 
 def _pairs(model: pycolmap.Reconstruction, reference: str, other: str) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of photos in a model that two cameras took at once.
-
-    Args:
-        reference, other: image prefixes of the cameras.
-    """
+    """Yield the pairs of photos in a model that two cameras took at once."""
     names = sorted(image.name for image in model.images.values() if image.has_pose)
     there = set(names)
     for name in names:

@@ -37,8 +37,6 @@ def sides_of_tags(markers: Mapping[str, Marker], side_m: float, stddev_m: float)
     """Return the four sides of each tag as measured lengths.
 
     Args:
-        markers: as ``find_tags`` returns them.
-        side_m: length of a side, metres.
         stddev_m: standard deviation of the error that all printed sides share, metres. The error that all corners found
             in photos share is added to it.
     """

@@ -19,8 +19,6 @@ class UnpublishedReconstruction:
     """The workspace of a new reconstruction in an output folder's private folder.
 
     Attributes:
-        folder: the workspace's folder.
-        progress: listener to its steps.
         log_path: place of COLMAP's log in the output folder.
     """
 

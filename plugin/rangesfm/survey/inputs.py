@@ -57,7 +57,6 @@ class RangingInputs:
         site: frame of the anchors' positions.
         tape: taped distances; empty if not given.
         reference: true positions; None if not given.
-        notes: warnings for the user.
         assumed: lines about how the files were read.
         positions: known positions of marks, in the frame of the anchors.
         imu: inertial sensor on the camera; None without one.
@@ -250,9 +249,6 @@ def read_log(
     """Read the radio's log as a survey describes it; see ``read_ranges``.
 
     Args:
-        options: of the log.
-        anchor_ids: ids that are known to be anchors.
-        tag_ids: ids that are known to be tags.
         files: to read in place of ``options.path``; empty: that path.
 
     Raises:
@@ -361,7 +357,6 @@ def of_one_tag(log: RangeLog, tag_id: str) -> RangeLog:
     """Return the ranges between one tag and anchors.
 
     Args:
-        log: with ranges of any kind.
         tag_id: of the tag; empty: the log has only one.
 
     Raises:

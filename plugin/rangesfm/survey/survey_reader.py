@@ -67,7 +67,6 @@ def read_survey(
     """Read a survey file.
 
     Args:
-        path: of the TOML file.
         overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file. Their paths are
             relative to the working directory.
         base_folder: folder to which paths in the file are relative; None: the folder of the file.

@@ -114,7 +114,6 @@ class SurveyRun:
         """Place the ranges on a path and hold out the check ranges.
 
         Args:
-            trajectory: of the camera.
             offset_s: image time minus range time, one for all ranges or (n,).
             may_be_none: whether it is fine if no range has a place on the path.
 
@@ -132,7 +131,6 @@ class SurveyRun:
         """Estimate the scale of a model by all that the survey has measured in it.
 
         Args:
-            path: model with the ranges on its path.
             bending: how the map is bent; None: it drifts as a map of poses does.
 
         Raises:

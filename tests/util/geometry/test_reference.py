@@ -168,5 +168,5 @@ def test_a_gap_of_the_limit_is_none_whatever_the_date() -> None:
     times = 1.7e9 + 0.1 * np.arange(20, dtype=np.float64)
     assert np.ptp(np.diff(times)) > 0
     reference = Reference(np.arange(60.0).reshape(20, 3), timestamps_s=times)
-    positions, _ = reference.poses(None, times[:-1] + 0.05, max_gap_s=0.1)
+    positions, _ = reference.poses(times[:-1] + 0.05, max_gap_s=0.1)
     np.testing.assert_allclose(positions, np.arange(57.0).reshape(19, 3) + 1.5, atol=1e-4)

@@ -38,13 +38,13 @@ def tag_positions(
     if (log.image_name is None) != (path.image_names is None):
         ours, theirs = ("name", "time") if path.image_names is None else ("time", "name")
         raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected the same", log.source)
-    times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
-    positions, rotations = path.poses(log.image_name, times_s, max_gap_s)
+    keys = log.image_name or () if log.timestamp_s is None else log.timestamp_s + time_offset_s
+    positions, rotations = path.poses(keys, max_gap_s)
     lever = np.asarray(tag_in_cam_m, dtype=np.float64)
     if np.any(lever != 0):
         if rotations is None:
             raise InputError("a lever arm needs the rotations qx,qy,qz,qw besides the positions")
         positions = positions + rotations @ lever
     if len(log) and not np.isfinite(positions).any():
-        raise InputError(path.why_nothing_is_known("ranges", log.image_name, times_s, max_gap_s), log.source)
+        raise InputError(path.why_nothing_is_known("ranges", keys, max_gap_s), log.source)
     return positions

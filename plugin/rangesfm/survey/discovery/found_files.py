@@ -88,7 +88,6 @@ class Found:
 
     Attributes:
         paths: folders of photos, videos, and other files, by dotted key of a survey file.
-        calibrations: cameras of each file with a calibration.
         models: folders of COLMAP models, and trajectories of SLAM programs.
         unclear: lists that are not understood for sure, by dotted key of a survey file.
         notes: lines about what is there and cannot be used; each such file is listed with the reason.
@@ -107,7 +106,6 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
     """Find possible inputs in folders and all their subfolders. Hidden files and results of runs are left out.
 
     Args:
-        folders: to look into.
         without: paths that are known already, and are left out.
 
     Raises:

@@ -59,7 +59,6 @@ def understand(
     """Look into folders and choose the inputs of a run.
 
     Args:
-        folders: to look into.
         given: values by dotted key from the user; inputs of these keys are not looked for.
         command: words of the command that the user has typed, for advice; empty: rangesfm init with the folders.
 

@@ -43,7 +43,6 @@ def open_images(path: Path, topic: str) -> PhotoSource:
     """Open the images of a bag as a source of photos.
 
     Args:
-        path: of the bag.
         topic: of the images; empty: the bag has only one image topic.
 
     Raises:
@@ -161,10 +160,6 @@ def _image_file(message: Any, path: Path) -> tuple[bytes, str]:
 
 def _opened(content: bytes, path: Path) -> Image.Image:
     """Decode an image file in grey, and at about MAX_SIDE_PX, which is much faster for JPEG.
-
-    Args:
-        content: of the file.
-        path: of the bag, for messages.
 
     Raises:
         InputError: it cannot be decoded.

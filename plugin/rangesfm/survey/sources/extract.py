@@ -31,7 +31,6 @@ class TakenPhotos(Record):
         rate_hz, topic: the user's choice of photos.
         image_names: names of the photos in order of time.
         camera: COLMAP's camera model and parameters, if the source has them.
-        notes: lines that the user should know.
     """
 
     files: _Files
@@ -57,13 +56,9 @@ def take_photos(
     """Write the sharpest frame of each ``1 / rate_hz`` seconds as a photo, and ``images.csv`` with their times.
 
     Args:
-        path: of a video or a bag.
         folder: for the photos. It is made or replaced when all is done. If it has these photos already, it is not
             changed.
-        rate_hz: photos per second.
         topic: of the images in a bag; empty: the bag has only one image topic.
-        progress: is told of the stage and of the photos.
-        restart: whether to extract the photos again even if the folder has them.
 
     Raises:
         InputError: the source cannot be read, or has fewer than two photos.

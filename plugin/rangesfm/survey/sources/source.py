@@ -25,9 +25,7 @@ class Frame:
     Attributes:
         number: of the frame in its source, from 0.
         time_s: time at which it was taken, seconds on the clock of the source.
-        suffix: of the file that ``write`` writes.
         grey: function that returns the picture in 8-bit grey, perhaps reduced in size.
-        write: function that writes the photo to a new file.
     """
 
     number: int
@@ -51,13 +49,11 @@ class PhotoSource:
 
     Attributes:
         what: description for the user.
-        size_px: width and height of the photos.
         duration_s: approximate duration.
         num_frames: number of frames by the header of the file; 0 where it does not say.
         clock: description of the times, for the user.
         frames: function that yields all frames in their order.
         camera: COLMAP's camera model and parameters, if the source has them.
-        notes: further lines that the user should know.
     """
 
     what: str
@@ -88,7 +84,6 @@ def open_source(path: Path, topic: str) -> PhotoSource:
     """Open a video or a bag and read all that is known before its frames are decoded.
 
     Args:
-        path: of the source.
         topic: of the images in a bag; empty: the bag has only one image topic.
 
     Raises:

@@ -108,7 +108,6 @@ class OutputFolder:
 
         Args:
             new: for each place the file or folder that goes there, from the private folder.
-            removed: places to clear.
             last: a file whose presence says that the others are complete. It is removed first and placed last.
 
         Raises:

@@ -158,8 +158,6 @@ def read_table(
     """Read the named columns of a file; other columns are ignored.
 
     Args:
-        required: columns that the file must have.
-        optional: columns that it may have.
         aliases: other names of columns in the file, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; FOUND: by the header row.
 

@@ -87,7 +87,6 @@ class MapErrors:
         """Return how a point errs relative to another one.
 
         Args:
-            first, second: the points.
             scale_stddev: standard deviation of the logarithm of the map's scale as it is stated. It replaces the one
                 that this covariance implies; how the map errs at a given scale stays as it is.
 

@@ -73,33 +73,34 @@ class Reference:
         Raises:
             InputError: the reference is by time and the trajectory has no times.
         """
-        if self.image_names is None and trajectory.timestamps_s is None:
-            raise InputError("the reference is by time, but the photos have no times (images.csv)")
-        return self.poses(trajectory.image_names, trajectory.timestamps_s, max_gap_s)
+        return self.poses(self.keys_of(trajectory), max_gap_s)
 
-    def poses(
-        self, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float
-    ) -> tuple[Array, Array | None]:
-        """Return the reference poses of n photos, or at n times if the reference is by time.
+    def keys_of(self, trajectory: Trajectory) -> Sequence[str] | Array:
+        """Return the names or times of a trajectory's keyframes, whichever the reference is by; errors as above."""
+        if self.image_names is not None:
+            return trajectory.image_names
+        if trajectory.timestamps_s is None:
+            raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return trajectory.timestamps_s
+
+    def poses(self, keys: Sequence[str] | Array, max_gap_s: float) -> tuple[Array, Array | None]:
+        """Return the reference poses of n photos, or at n times.
 
         Poses by photo are found by name. Poses by time are interpolated linearly (rotations on the shortest arc)
         between two samples at most ``max_gap_s`` apart. In longer gaps and at the ends, the nearest sample is taken if
         it is within MAX_TIME_DIFFERENCE_S.
 
         Args:
-            image_names: n photos; needed if the reference is by photo.
-            times_s: (n,) times on the camera's clock; needed if the reference is by time.
+            keys: names of n photos if the reference is by photo, else (n,) times on the camera's clock.
 
         Returns:
             (n, 3) positions in metres and (n, 3, 3) rotations, NaN where unknown; rotations are None if the reference
             has none.
         """
-        if self.image_names is not None:
-            assert image_names is not None
-            return self._at_index(rows_of_photos(image_names, self.image_names))
-        assert times_s is not None
+        if not isinstance(keys, np.ndarray):
+            return self._at_index(rows_of_photos(keys, self.image_names or ()))
         assert self.timestamps_s is not None
-        known = self.timestamps_s
+        times_s, known = keys, self.timestamps_s
         before, after, fraction, nearest = keyframes_around(times_s, known)
         nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
         positions, rotations = self._at_index(nearest)
@@ -116,28 +117,24 @@ class Reference:
             rotations[between] = turned.as_matrix()
         return positions, rotations
 
-    def why_nothing_is_known(
-        self, of: str, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float = 0.05
-    ) -> str:
+    def why_nothing_is_known(self, of: str, keys: Sequence[str] | Array, max_gap_s: float = 0.05) -> str:
         """Return a one-line message that explains why no keyframe or range is at a known position.
 
         Args:
-            of: "keyframes" or "ranges", with their ``image_names`` and ``times_s``.
+            of: "keyframes" or "ranges", with their ``keys`` as for ``poses``.
         """
         why = f"none of the {of} is at a known position: "
-        if len(self) == 0 or not len(image_names or ()) + len([] if times_s is None else times_s):
+        if len(self) == 0 or len(keys) == 0:
             return f"{why}there are {len(self)} known positions, or no {of}"
-        if self.image_names is not None:
-            assert image_names is not None
-            known, first = printable(self.image_names[0]), printable(image_names[0])
+        if not isinstance(keys, np.ndarray):
+            known, first = printable((self.image_names or ("",))[0]), printable(keys[0])
             return f"{why}the first known position is of photo '{known}', the first of the {of} of photo '{first}'"
         assert self.timestamps_s is not None
-        assert times_s is not None
         spacing = np.diff(self.timestamps_s)
         return (
             f"{why}positions are known from {span_text(self.timestamps_s[0], self.timestamps_s[-1])}"
             + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
-            + f", the {of} are from {span_text(times_s.min(), times_s.max())}; positions are interpolated between "
+            + f", the {of} are from {span_text(keys.min(), keys.max())}; positions are interpolated between "
             f"known times at most {max_gap_s:g} s apart"
         )
 

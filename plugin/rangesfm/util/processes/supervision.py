@@ -159,7 +159,6 @@ def supervise(
     Args:
         work: function of a module, which returns plain values.
         listen: called with each message.
-        environment: its environment variables.
         memory_limit_bytes: the process is killed if it takes more; 0: there is no limit.
         is_stopped: called several times a second; once it returns True, the process is interrupted.
     """
@@ -252,7 +251,6 @@ def run_children(
     Args:
         works: functions of a module that return the number of finished items; Ctrl-C may end them at any moment. They
             are taken one at a time, when they are needed; at most one waits for a process.
-        num_at_once: number of processes at the same time.
         update: called several times a second with the number of items that all processes have finished.
 
     Raises:

@@ -50,7 +50,6 @@ def read_ranges(
     Args:
         path: a file; or several files, a folder of them, or a pattern such as ``uwb_*.csv``, for example one file per
             anchor.
-        options: how to read the log.
         anchor_ids, tag_ids: known anchors and tags. They tell anchors from tags where the log does not, and ranges
             between two anchors or two tags from those between a tag and an anchor.
         said: single options by name. ``format`` is one of ``reader_names()``. ``columns`` gives the name in the file of
@@ -196,7 +195,6 @@ def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: st
     """Find the reader of a file.
 
     Args:
-        options: options of reading, for tables.
         format: name of the reader; empty: recognized by content.
 
     Raises:

@@ -235,13 +235,11 @@ def read_timestamps(
     """Return the times (n,) of the rows of a table in seconds, and the unit in which they are written.
 
     Args:
-        table: the rows.
         name: name of the column of timestamp and, if there are any, of date and nanoseconds.
         units: unit after the numbers of each column, by its name.
         said: unit that the user gave; None: found from names and values.
         notes: gets a line for the user on what was assumed.
         ask: returns the error about an ambiguous unit.
-        slowest_s: largest plausible median step between times.
         may_wrap: whether times that go back may be those of a counter that begins again.
 
     Raises:

@@ -32,8 +32,6 @@ class Counter(NamedTuple):
     """A counter that begins again at 0.
 
     Attributes:
-        bits: number of its bits.
-        period: period, in the unit of the file.
         num_wraps: how often it begins again.
     """
 

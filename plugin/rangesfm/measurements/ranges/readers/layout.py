@@ -118,8 +118,6 @@ class ColumnSample:
     """A column with its name and its first cells.
 
     Attributes:
-        name: name of the column.
-        cells: its first cells.
         unit: unit after each of its numbers, "" if there is none.
         cure: conversion of its cells, which has been applied to ``cells``.
     """

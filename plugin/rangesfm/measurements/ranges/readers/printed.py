@@ -48,7 +48,6 @@ def _reader(
     Args:
         example: part of a line that is understood, for messages.
         begin: beginning of the first range in a line; the host's time is before it.
-        each: beginning of each range.
         whole: a complete phrase. Groups x, y and z, if present, are the position of the anchor in metres. A group time,
             if present, is the time of the range, and no time before the phrase is used.
         ranges: yields the ranges of a phrase, given its time in seconds and its line.

@@ -34,7 +34,6 @@ class ReadOptions(RangesOptions):
 
         Args:
             quantity: "range" or "timestamp".
-            units: the possible units.
             why: what was found.
         """
         flag, either = f"{quantity}_unit", " or ".join(units)
@@ -57,7 +56,6 @@ class Reader:
     Attributes:
         name: name by which the user asks for the format.
         recognizes: returns whether the beginning of a file has this format.
-        read: reads the whole file.
         read_anchors: returns the anchors whose positions the log contains.
         roles: what the log says about the two ends of a range.
     """
