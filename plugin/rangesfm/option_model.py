@@ -136,7 +136,7 @@ class Options(BaseModel):
 
     table: ClassVar[str]
 
-    def __init_subclass__(cls, *, table: str | None = None, **config: Any):
+    def __init_subclass__(cls, *, table: str = "", **config: Any):
         super().__init_subclass__(**config)
         cls.table = table or cls.table
 
@@ -165,7 +165,7 @@ class Options(BaseModel):
             meta = next((item for item in field.metadata if isinstance(item, KeyMeta)), KeyMeta())
             if not meta.is_key:
                 continue
-            unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), None)
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), "")
             told = {"flag": meta.flag or name, "expected": meta.expected or _described(hints[name], unit)}
             type_ = bare[name]
             if get_origin(type_) in (Union, types.UnionType):
@@ -194,7 +194,7 @@ class Options(BaseModel):
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)
 
 
-def _described(hint: Any, unit: str | None) -> str:
+def _described(hint: Any, unit: str) -> str:
     """Return a description of the values that a type allows, with bounds and unit: "a number of metres from 0 to 1"."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:

@@ -233,8 +233,8 @@ class RangesOptions(RangeModelOptions):
         Annotated[str, Field(max_length=1)], KeyMeta(metavar="CHARACTER", expected="one character")
     ] = ""
     """Character between the cells of a row (default: recognised)."""
-    ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
-    """Time between two ranging rounds, for a Qorvo log without times of the host (default: 0.2)."""
+    ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] = 0.2
+    """Time between two ranging rounds, for a Qorvo log without times of the host."""
     stamp_unit: Literal["ns", "us", "ms", "s", "ticks"] = "ns"
     """Unit of the time stamps, in a log without ranges."""
     stamp_bits: Literal[32, 40] = 32

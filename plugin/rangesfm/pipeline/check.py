@@ -134,8 +134,8 @@ def _check_mapper(survey: Survey, photos: Photos, checked: CheckedSurvey) -> Non
     if mapper.mask_path is not None:
         masks = contents_of_masks(mapper.mask_path, photos)
         checked.facts.append(f"masks: of {len(masks)} photos")
-    with TemporaryDirectory() as scratch, opened(mapper.database_path, photos, Path(scratch)) as given:
-        if given is not None:
+    if mapper.database_path is not None:
+        with TemporaryDirectory() as scratch, opened(mapper.database_path, photos, Path(scratch)) as given:
             checked.facts.append(f"database: {given.note}")
 
 

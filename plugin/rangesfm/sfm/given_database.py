@@ -81,16 +81,13 @@ class GivenDatabase:
 
 
 @contextmanager
-def opened(path: Path | None, photos: Photos, folder: Path) -> Iterator[GivenDatabase | None]:
-    """Copy the database, if one is given, into ``folder`` for the duration of the block.
+def opened(path: Path, photos: Photos, folder: Path) -> Iterator[GivenDatabase]:
+    """Copy a database into ``folder`` for the duration of the block.
 
     Raises:
         InputError: it is not a database of COLMAP's, has features of fewer than two of the photos, or has neither
             matches nor descriptors.
     """
-    if path is None:
-        yield None
-        return
     with scratch_folder(folder / "given_database") as scratch:
         copy = Path(shutil.copyfile(path, scratch / "database.db"))
         if (log := path.with_name(path.name + "-wal")).is_file():  # changes that SQLite has not yet put into the file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -210,7 +210,8 @@ def photo_matching(
         name, reason = next(iter(photos.left_out.items()))
         num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)
         progress.message(f"{num} of {num_all} photos are left out; the first, {name}, {reason}")
-    with opened(mapper.database_path, photos, unpublished.folder) as given:
+    path = mapper.database_path
+    with nullcontext() if path is None else opened(path, photos, unpublished.folder) as given:
         if given is not None:
             progress.message(given.note)
             photos = given.photos

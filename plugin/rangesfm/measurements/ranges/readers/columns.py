@@ -115,7 +115,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
         column = name.get("range") or next(iter(columns.wide))
         column = f"{column} {units.get(column, '')}".strip()
         ask = partial(options.which_unit, path, "range")
-        times = None if timestamps is None else timestamps[row[measured]]
+        times = np.zeros(0) if timestamps is None else timestamps[row[measured]]
         unit = options.range_unit or range_unit(column, ranges[measured], times, link[measured], notes, ask)
         mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
         others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges[measured], unit)]

@@ -187,7 +187,6 @@ def _mauwb_ranges(record: re.Match[str], timestamp_s: float, line: int) -> Itera
 
 
 # Qorvo's shell of DWM3001CDK and QM33: SESSION_INFO_NTF: {..} on several lines, or older {"Block":1, "results":[..]}.
-_DEFAULT_RANGING_INTERVAL_S = 0.2
 _QORVO_BEGIN = re.compile(r'SESSION_INFO_NTF:?\s{0,9}\{|\{\s{0,9}"Block"\s{0,9}:', re.ASCII)
 _QORVO_END = re.compile(r"\]\s{0,9}\}")
 _QORVO_COUNTERS = tuple(
@@ -206,7 +205,6 @@ _QORVO_MEASUREMENT = re.compile(
 def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
     """Yield the ranges with the host's time before a record, or if there is none, by the radio's interval count."""
     text, clock = read_text(path, errors="replace"), HostClock(path, options)
-    interval_s = options.ranging_interval_s or _DEFAULT_RANGING_INTERVAL_S
     has_host_time, count = None, -1
     begins = list(_QORVO_BEGIN.finditer(text))
     line_starts = [0, *(end.end() for end in re.finditer("\n", text))]
@@ -221,7 +219,7 @@ def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
             timestamp_s = clock.seconds(prefix, line)
         else:
             count = _qorvo_count(body, count, path, line)
-            timestamp_s = count * interval_s
+            timestamp_s = count * options.ranging_interval_s
         measurements = list(_QORVO_MEASUREMENT.finditer(body))
         for found in measurements:
             anchor_id, range_cm = found["id"] or found["json_id"], found["cm"] or found["json_cm"]

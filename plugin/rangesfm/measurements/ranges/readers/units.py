@@ -82,11 +82,11 @@ def days_before_1970(days: Array) -> float:
     return next((first for (low, high), first in _DAYS_OF_1970.items() if low < middle < high), 0.0)
 
 
-def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, notes: list[str], ask: Ask) -> str:
+def range_unit(name: str, ranges: Array, times: Array, pair: Indices, notes: list[str], ask: Ask) -> str:
     """Return the unit of a column of positive ranges, and add a note if it is not from the name.
 
     Args:
-        times: (n,) seconds, or None.
+        times: (n,) seconds, or empty if they are not known.
         pair: (n,) index of each range's pair of nodes.
 
     Raises:
@@ -120,12 +120,12 @@ def units_within_reach(ranges: Array, unit: str) -> list[str]:
     return [other for other in ("cm", "mm", "ft") if other != unit and middle / UNITS_PER_METRE[other] <= REACH_M]
 
 
-def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, unit: str) -> float:
+def _share_of_jumps(ranges_m: Array, times: Array, pair: Indices, unit: str) -> float:
     """Return the share of ranges that differ from their pair's previous one by more than noise and motion allow.
 
     Ranges that are too long for the unit are left out.
     """
-    if times is None:
+    if not len(times):
         return 0.0
     order = np.lexsort((times, pair))
     order, noise_m = order[ranges_m[order] <= _LARGEST_M[unit]], _NOISE_M[unit]
