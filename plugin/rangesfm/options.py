@@ -289,7 +289,7 @@ class AnchorOptions(Options, table="anchors"):
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
     frame: Annotated[Literal["site", "first_camera", "unknown"] | None, KeyMeta(flag="anchor_frame")] = None
     """Frame of the anchors' coordinates (default: site if the file has any position, else unknown)."""
-    crs: Annotated[str | None, KeyMeta(flag="anchor_crs")] = None
+    crs: Annotated[str, KeyMeta(flag="anchor_crs")] = ""
     """Coordinate reference system of the anchors' positions, such as EPSG:2056 (default: a local frame in metres)."""
     use: Annotated[_Texts, KeyMeta(flag="use_anchors")] = ()
     """Ids of the anchors whose ranges are used (default: all)."""
@@ -307,7 +307,7 @@ class PointOptions(Options, table="points"):
     east and y north, if they are such (default: recognised)."""
     unit: Annotated[_LengthUnit | None, KeyMeta(flag="point_unit")] = None
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
-    crs: Annotated[str | None, KeyMeta(flag="point_crs")] = None
+    crs: Annotated[str, KeyMeta(flag="point_crs")] = ""
     """Coordinate reference system of the points, such as EPSG:2056 (default: that of gcp_list.txt, else the frame of
     the anchors)."""
     stddev_m: Annotated[_Positive, KeyMeta(flag="point_stddev_m")] = 0.01
@@ -332,7 +332,7 @@ class PositionOptions(Options, table="positions"):
     """Unit of the times, as timestamp_unit in [ranges] (default: by column name or values)."""
     unit: Annotated[_LengthUnit | None, KeyMeta(flag="position_unit")] = None
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
-    crs: Annotated[str | None, KeyMeta(flag="position_crs")] = None
+    crs: Annotated[str, KeyMeta(flag="position_crs")] = ""
     """Coordinate reference system of the positions, such as EPSG:2056 (default: that of the format, else the frame of
     anchors and points)."""
     tag_id: Annotated[str, KeyMeta(flag="position_tag_id")] = ""
@@ -503,7 +503,7 @@ class ExportOptions(Options, table="export"):
     up: str = "auto"
     """Upward direction, for the frames level and enu. cameras: mean upward direction of the photos; path: perpendicular
     to the plane of the path; X,Y,Z: a direction in the result's frame; auto: z in a site frame, else as cameras."""
-    crs: Annotated[str | None, KeyMeta(flag="export_crs")] = None
+    crs: Annotated[str, KeyMeta(flag="export_crs")] = ""
     """Coordinate reference system of LAZ and GeoPackage files, such as EPSG:2056 (default: that of the anchors, else
     longitude and latitude)."""
     origin_anchor: str = ""

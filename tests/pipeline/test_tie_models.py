@@ -31,7 +31,7 @@ from rangesfm.util.geometry.similarity import align_points, rmse
 def run_of(looped: LoopedSurvey, folder: Path) -> SurveyRun:
     """Return the run of a survey whose photos were matched with neighbours in time."""
     survey = looped.survey
-    (site, _), log = local_site((), "unknown", None), range_log(survey, 1, num_each=4)
+    (site, _), log = local_site((), "unknown", ""), range_log(survey, 1, num_each=4)
     anchors = tuple(Anchor(name, position) for name, position in survey.anchors_m.items())
     inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, Tape(), None, ())
     write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)

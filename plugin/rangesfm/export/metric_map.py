@@ -192,7 +192,7 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
             forward_in_world=map_.trajectory.world_from_cam[0][:, 2],
             heading_deg=options.heading_deg,
         )
-    if georeference is not None and options.crs is not None:
+    if georeference is not None and options.crs:
         check_crs(options.crs)
         georeference = replace(georeference, crs=options.crs)
     return replace(map_, georeference=georeference)

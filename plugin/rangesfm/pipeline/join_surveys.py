@@ -256,7 +256,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     require_apart(folders, survey.output.path)
     log, number, is_check = joined_log(finished, survey.anchors.use)
     anchors, frame = _anchors(survey, finished, log)
-    crs = survey.anchors.crs or _common(one.result.summary.settings.anchors.crs for one in finished)
+    crs = survey.anchors.crs or _common(one.result.summary.settings.anchors.crs for one in finished) or ""
     site, anchors = local_site(anchors, frame, crs, survey.anchors.path)
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])

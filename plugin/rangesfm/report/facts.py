@@ -77,7 +77,7 @@ def _coordinates(content: Content) -> str:
     if summary.frame == "site":
         anchors, crs = summary.settings.anchors.path, summary.settings.anchors.crs
         whose = "the site" if anchors is None else f"the site, those of {anchors.rsplit('/', 1)[-1]}"
-        return f"x, y, z in metres in the frame of {whose}{'' if crs is None else f' ({crs})'}; z is up."
+        return f"x, y, z in metres in the frame of {whose}{f' ({crs})' if crs else ''}; z is up."
     return f"x, y, z in metres in {frame_in_words(content)}. Nothing fixes the map's place in a site."
 
 

@@ -194,7 +194,7 @@ def _surveyed_positions(
         raise InputError(f"[{table}] are in the site, expected [anchors] frame to be site as well", path)
     is_placed = frame == "site" and any(anchor.position_m is not None for anchor in anchors)
 
-    def local(coordinates: Array, crs: str | None, path: Path | None) -> Array:
+    def local(coordinates: Array, crs: str, path: Path | None) -> Array:
         nonlocal site, is_placed
         if is_placed:
             return site.local(coordinates, crs, path)

@@ -69,7 +69,7 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         position_m=track.log.position_m[rows],
         covariance_m2=track.log.covariance_m2[rows],
         is_stated=np.asarray(np.isfinite(track.log.covariance_m2[rows]).all(axis=(1, 2))),
-        is_geodetic=np.full(k, track.log.crs is not None),
+        is_geodetic=np.full(k, bool(track.log.crs)),
         places=on_path.centers,
         arms_m=on_path.arms_m,
         own_covariance=on_path.stddev[:, None, None] ** 2 * np.eye(3),

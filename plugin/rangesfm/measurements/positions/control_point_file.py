@@ -63,7 +63,7 @@ def is_gcp_list(head: str) -> bool:
     first, *rows = [line for line in head.split("\n") if line.strip() and not line.startswith("#")] or [""]
     cells = [row.split() for row in rows]
     are_points = any(len(row) > _NUM_GCP_NUMBERS and all(map(is_number, row[:_NUM_GCP_NUMBERS])) for row in cells)
-    return crs_of_line(first) is not None and are_points
+    return bool(crs_of_line(first)) and are_points
 
 
 def is_point_file(head: str) -> bool:
@@ -119,7 +119,7 @@ def _points(rows: ListRows, options: PointOptions) -> ControlPoints:
         table.refuse(wrong, rows.columns["kind"], f"{CONTROL} or {CHECK}")
     each = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     points = tuple(ControlPoint(*row) for row in each)
-    return ControlPoints(points, {}, "stddev" in rows.columns, None, table.path, rows.notes)
+    return ControlPoints(points, {}, "stddev" in rows.columns, "", table.path, rows.notes)
 
 
 def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
@@ -127,11 +127,11 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
 
     A point without a name is known by its coordinates.
     """
-    crs, points, marks = None, dict[str, ControlPoint](), dict[str, list[tuple[str, list[float], int]]]()
+    crs, points, marks = "", dict[str, ControlPoint](), dict[str, list[tuple[str, list[float], int]]]()
     for line, text in enumerate(read_text(path).split("\n"), 1):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
-        if crs is None:
+        if not crs:
             crs = crs_of_line(text)
             continue
         numbers, image_name, rest = _cells_of_gcp(text, path, line)

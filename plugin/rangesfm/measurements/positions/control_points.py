@@ -41,7 +41,7 @@ class ControlPoints:
         points: in the order of the file.
         markers: marks in photos, by name; a point without any is in no photo.
         stddevs_are_given: whether the file gives the standard deviations.
-        crs: coordinate system named in the file; None if there is none.
+        crs: coordinate system named in the file; empty if there is none.
         path: the file, for messages.
         notes: lines for the user about how the file was read.
     """
@@ -49,7 +49,7 @@ class ControlPoints:
     points: tuple[ControlPoint, ...] = ()
     markers: Mapping[str, Marker] = field(default_factory=dict)
     stddevs_are_given: bool = True
-    crs: str | None = None
+    crs: str = ""
     path: Path | None = None
     notes: tuple[str, ...] = ()
 

@@ -33,7 +33,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         position_m=np.array([point.position_m for point in seen]).reshape(-1, 3),
         covariance_m2=stddev_m[:, None, None] ** 2 * np.eye(3),
         is_stated=np.full(k, points.stddevs_are_given),
-        is_geodetic=np.full(k, points.crs is not None),
+        is_geodetic=np.full(k, bool(points.crs)),
         places=np.array([each.position_m for each in found]).reshape(-1, 3),
         arms_m=np.zeros((k, 3)),
         own_covariance=np.array([each.errors.own_m2 for each in found]).reshape(-1, 3, 3),

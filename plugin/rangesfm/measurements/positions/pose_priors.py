@@ -54,4 +54,4 @@ def read_pose_priors(path: Path) -> PositionLog:
         image_name=[names.get(prior.corr_data_id.id, "") for prior in priors],
         covariance_m2=np.full_like(covariances, np.nan) if is_geographic else covariances,
     )
-    return replace(log, crs=GEOGRAPHIC if is_geographic else None)
+    return replace(log, crs=GEOGRAPHIC if is_geographic else "")

@@ -152,14 +152,14 @@ def _log_of_table(
     crs = crs_in_head(read_head(path))
     kept = _of_one_tag(table, names, options.tag_id, path)
     columns = [table.numbers(names[axis], empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
-    are_degrees = crs is None and options.crs is None and options.unit is None and _are_degrees(names, columns)
+    are_degrees = not (crs or options.crs) and options.unit is None and _are_degrees(names, columns)
     bounds = {axis: DEGREES if are_degrees and axis != "z" else COORDINATE_M for axis in AXES}
     for k, axis in enumerate(AXES):
         columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[units[axis]]
         table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), names[axis], str(bounds[axis]))
     position = np.column_stack(columns)
     is_lost = np.zeros(len(table), dtype=bool)
-    if are_degrees or crs is not None:  # receivers without a fix write zeros, which is in the Atlantic
+    if are_degrees or crs:  # receivers without a fix write zeros, which is in the Atlantic
         is_lost |= (position[:, 0] == 0) & (position[:, 1] == 0)
     if "quality" in names:
         is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
@@ -241,7 +241,7 @@ def _is_odm(head: str) -> bool:
     first, second = ([line for line in head.split("\n") if line.strip() and line[0] != "#"] + ["", ""])[:2]
     name, *numbers = second.split() or [""]
     are_numbers = len(numbers) > 1 and all(map(is_number, numbers[:2]))
-    return crs_of_line(first) is not None and not is_number(name) and are_numbers
+    return bool(crs_of_line(first)) and not is_number(name) and are_numbers
 
 
 def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
@@ -249,11 +249,11 @@ def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
 
     The two stddevs at the end are horizontal and vertical (docs.opendronemap.org, "Image geolocation files").
     """
-    crs, names, lines, numbers = None, list[str](), list[int](), list[list[float]]()
+    crs, names, lines, numbers = "", list[str](), list[int](), list[list[float]]()
     for line, text in enumerate(read_text(path).split("\n"), 1):
         if not text.strip() or text.startswith("#"):
             continue
-        if crs is None:
+        if not crs:
             crs = crs_of_line(text)
             continue
         name, *cells = text.split("\t") if text.count("\t") > 2 else text.split()
@@ -437,7 +437,7 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
         covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
         notes=notes,
     )
-    return replace(log, crs=GEOGRAPHIC if is_geographic else None)
+    return replace(log, crs=GEOGRAPHIC if is_geographic else "")
 
 
 def _time_of_rtklib(first: str, second: str) -> float:

@@ -19,29 +19,29 @@ GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres."""
 
 
-def crs_of_line(text: str) -> str | None:
-    """Return the coordinate system that a line consists of; None if it is none."""
+def crs_of_line(text: str) -> str:
+    """Return the coordinate system that a line consists of; empty if it is none."""
     found = _CRS.fullmatch(text)
     if found is None:
-        return None
+        return ""
     number, parameters, zone, half = found.groups()
     return number or parameters or f"EPSG:{(326 if half.upper() == 'N' else 327) * 100 + int(zone)}"
 
 
-def crs_in_head(head: str) -> str | None:
+def crs_in_head(head: str) -> str:
     """Return the coordinate system that a file names before its rows: a line of its own, or a number in a comment."""
     for line in head.split("\n"):
         if line.strip() and not line.lstrip().startswith("#"):
             return crs_of_line(line)
         if crs := crs_in_text(line):
             return crs
-    return None
+    return ""
 
 
-def crs_in_text(text: str) -> str | None:
+def crs_in_text(text: str) -> str:
     """Return the coordinate system of a text by its number; that at the end of WKT is that of the whole system."""
     numbers = _EPSG.findall(text)
-    return f"EPSG:{numbers[-1]}" if numbers else None
+    return f"EPSG:{numbers[-1]}" if numbers else ""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PositionLog:
         image_name: names of the n photos; or None.
         line: (n,) lines in the file.
         path: the file, for messages. format: name of its format.
-        crs: coordinate system of the positions as they were read; None if neither their format nor the user says it.
+        crs: coordinate system of the positions as they were read; empty if neither their format nor the user says it.
         notes: lines for the user about how the file was read.
     """
 
@@ -66,7 +66,7 @@ class PositionLog:
     line: Indices
     path: Path | None = None
     format: str = "table"
-    crs: str | None = None
+    crs: str = ""
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:

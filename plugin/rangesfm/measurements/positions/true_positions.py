@@ -29,6 +29,6 @@ def read_true_positions(path: AnyPath) -> Reference:
     except UnclearListError as error:
         raise InputError(f"{'; '.join(error.about)}; {_EXPECTED}", path) from None
     assert log is not None
-    if log.crs is not None:
+    if log.crs:
         raise InputError(f"the positions are in {log.crs}, expected metres in the frame of the map", path)
     return Reference(log.position_m, image_names=log.image_name, timestamps_s=log.timestamp_s, notes=log.notes)

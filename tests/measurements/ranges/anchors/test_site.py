@@ -21,7 +21,7 @@ def anchors_at(*positions: list[float] | None) -> tuple[Anchor, ...]:
 
 
 def test_far_anchors_are_moved_by_whole_metres_and_unknown_ones_stay_unknown() -> None:
-    site, anchors = local_site(anchors_at([*FAR], None, [*(FAR + np.array([10.0, 0, 2]))]), "site", None)
+    site, anchors = local_site(anchors_at([*FAR], None, [*(FAR + np.array([10.0, 0, 2]))]), "site", "")
     np.testing.assert_array_equal(site.offset_m, [2_600_005, 1_200_000, 401])
     assert anchors[1].position_m is None
     assert anchors[2].position_m is not None
@@ -31,7 +31,7 @@ def test_far_anchors_are_moved_by_whole_metres_and_unknown_ones_stay_unknown() -
 @pytest.mark.parametrize("frame", ["site", "first_camera"])
 def test_near_anchors_and_those_of_other_frames_stay(frame: str) -> None:
     places = [[10.0, 20.0, 3.0], [-10.0, 0.0, 1.0]] if frame == "site" else [[*FAR]]
-    site, anchors = local_site(anchors_at(*places), frame, None)
+    site, anchors = local_site(anchors_at(*places), frame, "")
     assert not site.offset_m.any()
     np.testing.assert_array_equal([anchor.position_m for anchor in anchors], places)
 
@@ -53,19 +53,19 @@ def test_a_coordinate_system_needs_positions_on_the_earth(frame: str, position: 
     ("of_site", "of_points", "said"),
     [
         (
-            None,
+            "",
             "EPSG:2056",
             "these coordinates have a coordinate system and those of the anchors or control points have none",
         ),
         (
             "EPSG:2056",
-            None,
+            "",
             "those of the anchors or control points have a coordinate system and these coordinates have none",
         ),
     ],
 )
 def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
-    of_site: str | None, of_points: str | None, said: str
+    of_site: str, of_points: str, said: str
 ) -> None:
     site, _ = local_site(anchors_at([*FAR], [*(FAR + 10.0)]), "site", of_site)
     with pytest.raises(InputError, match=said):
@@ -76,14 +76,14 @@ def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
 def test_a_site_is_moved_if_it_is_farther_away_than_it_is_large(distance_m: float, offset_m: float) -> None:
     across = np.array([0.0, 4.0, 0.0])
     coordinates = np.array([distance_m, 0.0, 0.0]) + np.stack([across, np.full(3, np.nan), -across])
-    site, local = site_of(coordinates, None)
+    site, local = site_of(coordinates, "")
     np.testing.assert_array_equal(site.offset_m, [offset_m, 0.0, 0.0])
     np.testing.assert_array_equal(local, coordinates - np.array([offset_m, 0.0, 0.0]))
 
 
 def test_further_points_are_moved_with_the_anchors() -> None:
     points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    np.testing.assert_array_equal(Site(np.array([1.0, 1.0, 2.0])).local(points, None), [[0, 1, 1], [3, 4, 4]])
+    np.testing.assert_array_equal(Site(np.array([1.0, 1.0, 2.0])).local(points, ""), [[0, 1, 1], [3, 4, 4]])
 
 
 def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> None:
@@ -100,8 +100,8 @@ def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> 
 @pytest.mark.parametrize(
     ("given", "crs", "texts", "place"),
     [
-        ((1012.0, 5003.9791, 413.0), None, ("1012.000", "5003.979", "413.000"), "1012, 5003.98, 413"),
-        ((0.0, -0.0001, 3.0), None, ("0.000", "0.000", "3.000"), "0, 0, 3"),
+        ((1012.0, 5003.9791, 413.0), "", ("1012.000", "5003.979", "413.000"), "1012, 5003.98, 413"),
+        ((0.0, -0.0001, 3.0), "", ("0.000", "0.000", "3.000"), "0, 0, 3"),
         (
             (2_600_000.1234, 1_200_000.0, 450.0),
             "EPSG:2056",
@@ -117,7 +117,7 @@ def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> 
     ],
 )
 def test_texts_have_the_coordinates_that_were_given(
-    given: tuple[float, float, float], crs: str | None, texts: tuple[str, str, str], place: str
+    given: tuple[float, float, float], crs: str, texts: tuple[str, str, str], place: str
 ) -> None:
     site, (anchor, _) = local_site(anchors_at([*given], [given[0] + 1e-4, given[1], given[2] + 7.0]), "site", crs)
     assert anchor.position_m is not None
@@ -133,7 +133,7 @@ def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:
         "anchors.csv: [anchors] crs is EPSG:2056, which is for anchors surveyed in a site frame, but no anchor has a "
         "position"
     )
-    site, anchors = local_site((), "site", None)
+    site, anchors = local_site((), "site", "")
     assert (anchors, site.georeference) == ((), None)
     with pytest.raises(InputError, match=r"^anchors\.csv: .*EPSG:2056"):
         site_of(np.zeros((1, 3)), "EPSG:2056", Path("anchors.csv"))
@@ -142,7 +142,7 @@ def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:
 def test_degrees_of_no_known_system_are_refused_and_small_things_in_metres_are_not() -> None:
     at = np.array([[8.541694, 47.376887, 408.0], [8.541831, 47.376954, 409.5], [8.541755, 47.376801, 407.0]])
     with pytest.raises(InputError, match=r"points\.csv: coordinates look like degrees \(x from 8\.541694 to 8\.541831"):
-        site_of(at, None, Path("points.csv"))
+        site_of(at, "", Path("points.csv"))
     on_a_table = np.array([[0.0121234, 0.0331234, 0.1], [0.0221234, 0.0111234, 0.2], [0.0321234, 0.0251234, 0.3]])
     for metres in (on_a_table, np.round(on_a_table + np.array([8.5, 47.3, 0.0]), 4), 1e3 * at):
-        site_of(metres, None)
+        site_of(metres, "")

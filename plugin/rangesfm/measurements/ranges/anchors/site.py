@@ -38,21 +38,21 @@ class Site:
     offset_m: Array = field(default_factory=lambda: np.zeros(3))
     georeference: Georeference | None = None
 
-    def local(self, coordinates: Array, crs: str | None, path: Path | None = None) -> Array:
+    def local(self, coordinates: Array, crs: str, path: Path | None = None) -> Array:
         """Return (n, 3) further coordinates in the local frame.
 
         Args:
-            crs: their coordinate system; None: the same frame as the anchors'. path: their file, for messages.
+            crs: their coordinate system; empty: the same frame as the anchors'. path: their file, for messages.
 
         Raises:
             InputError: only one of the site and the coordinates has a coordinate system.
         """
-        if (crs is None) != (self.georeference is None):
+        if bool(crs) != (self.georeference is not None):
             which = ["these coordinates", "those of the anchors or control points"]
             has, lacks = which if crs else reversed(which)
             advice = "give it, such as EPSG:2056, by --anchor_crs, --point_crs or --position_crs"
             raise InputError(f"{has} have a coordinate system and {lacks} have none, expected both: {advice}", path)
-        if crs is None or self.georeference is None:
+        if self.georeference is None:
             return coordinates - self.offset_m
         return self.georeference.local(coordinates, crs)
 
@@ -85,14 +85,14 @@ class Site:
 
 
 def local_site(
-    anchors: tuple[Anchor, ...], frame: str, crs: str | None, path: Path | None = None
+    anchors: tuple[Anchor, ...], frame: str, crs: str, path: Path | None = None
 ) -> tuple[Site, tuple[Anchor, ...]]:
     """Return a local frame for anchors, and the anchors in it.
 
     Args:
         anchors: the anchors as given.
         frame: frame of their positions, one of ANCHOR_FRAMES; only "site" is moved.
-        crs: coordinate system of the positions, which gives a local frame east, north, up; None: metres in any frame.
+        crs: coordinate system of the positions, which gives a local frame east, north, up; empty: metres in any frame.
         path: the anchor file, for messages.
 
     Raises:
@@ -102,7 +102,7 @@ def local_site(
     given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
     known = np.isfinite(given).all(axis=1)
     if frame != "site" or not known.any():
-        if crs is not None:
+        if crs:
             what = "no anchor has a position" if frame == "site" or not known.any() else f"the frame is {frame!r}"
             raise InputError(f"[anchors] crs is {crs}, which is for anchors surveyed in a site frame, but {what}", path)
         return Site(), anchors
@@ -110,13 +110,13 @@ def local_site(
     return site, _at(anchors, local)
 
 
-def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tuple[Site, Array]:
+def site_of(coordinates: Array, crs: str, path: Path | None = None) -> tuple[Site, Array]:
     """Return a local frame for coordinates (n, 3) of a site, and the coordinates in it; NaN rows stay NaN.
 
     Raises:
         InputError: the coordinate system is not valid at these points, or they are degrees of no known system.
     """
-    if crs is not None:
+    if crs:
         try:
             georeference, local = georeference_at(coordinates, crs)
         except InputError as error:
