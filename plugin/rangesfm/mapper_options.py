@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.option_model import KeyMeta, Options
+from rangesfm.option_model import Key, Options
 
 # A key this similar to one of ours (difflib's ratio, 0 to 1) is a typing error; any other key is meant for pycolmap.
 _LIKE_OURS = 0.85
@@ -19,27 +19,27 @@ _LIKE_OURS = 0.85
 class MapperOptions(Options, table="mapper"):
     """Mapping of the photos to an unscaled model by COLMAP. Other keys are passed to pycolmap as in pipeline."""
 
-    method: Annotated[Literal["incremental", "global", "hierarchical", "external"], KeyMeta(flag="mapper_method")] = (
+    method: Annotated[Literal["incremental", "global", "hierarchical", "external"], Key(flag="mapper_method")] = (
         "incremental"
     )
     """COLMAP's mapper, or another one. incremental: photo by photo; global: all photos at once; hierarchical: photo by
     photo in clusters, which are then merged; external: the program of command."""
-    command: Annotated[str, KeyMeta(flag="mapper_command", metavar="COMMAND")] = ""
+    command: Annotated[str, Key(flag="mapper_command", metavar="COMMAND")] = ""
     """External mapper with its arguments, quoted as in a shell, but run without one. It is run in a folder with a copy
     of the database as database.db, and writes a COLMAP model to sparse/0. {images} stands for the folder of the
     photos."""
     matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
     """Pairs of photos that are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
     EXIF position; vocabtree: photos that look alike; auto: exhaustive up to 60 keyframes, sequential above."""
-    vocab_tree_path: Annotated[Path | None, KeyMeta(metavar="TREE", role="file")] = None
+    vocab_tree_path: Annotated[Path | None, Key(metavar="TREE", role="file")] = None
     """File with COLMAP's vocabulary tree, which finds photos that look alike. vocabtree matching needs it, and so does
     loop_detection with sequential matching; it is never downloaded."""
-    pairs: Annotated[Path | None, KeyMeta(role="file")] = None
+    pairs: Annotated[Path | None, Key(role="file")] = None
     """Text file with the names of two photos on each line, separated by a tab. Only these pairs are matched."""
-    mask_path: Annotated[Path | None, KeyMeta(role="photos")] = None
+    mask_path: Annotated[Path | None, Key(role="photos")] = None
     """Folder of masks. The mask of photo a/b.jpg is a/b.jpg.png, of the same size, black where features are not
     wanted."""
-    database_path: Annotated[Path | None, KeyMeta(metavar="DB", role="file")] = None
+    database_path: Annotated[Path | None, Key(metavar="DB", role="file")] = None
     """COLMAP database, also one written by hloc. It is copied. Its features and matches are used, and its cameras too
     unless [camera] gives a model or params; what it lacks is computed. Photos that are not in it are left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -61,7 +61,7 @@ class MapperOptions(Options, table="mapper"):
     refine where database_path gives the matches."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
-        KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),
+        Key(expected="1 or more up to 4096, or -1 for all cores"),
     ] = -1
     """Number of threads; -1: one for each core. Matching on the processor runs this many processes with one thread
     each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets the threads of a process."""

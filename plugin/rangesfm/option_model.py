@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import (
@@ -75,16 +75,21 @@ class Bounds:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyMeta:
-    """Annotation of a key: what its name and its type do not say.
+class Key:
+    """A key of a survey file. The annotation of its field says what its name, type and docstring do not.
+
+    ``Options.keys`` fills in all the rest.
 
     Attributes:
-        flag: name of the flag on the command line, without dashes; empty: that of the key.
+        flag: name of the flag on the command line, without dashes; if the annotation has none, that of the key.
         metavar: placeholder for the value in the help text; empty: by the type.
-        expected: description of valid values, for messages; empty: made from type and bounds.
+        expected: description of valid values, for messages; if the annotation has none, made from type and bounds.
         role: of a path, what kind of file or folder it leads to.
         is_key: whether users may write it into the survey file.
         is_common: whether most people need it, so that the short help of a command has its flag.
+        table, name: its place.
+        type: of the value, without the None that means "not given".
+        meaning: the docstring on one line without its full stop, followed by the default.
     """
 
     flag: str = ""
@@ -93,25 +98,10 @@ class KeyMeta:
     role: PathRole | None = None
     is_key: bool = True
     is_common: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Key(KeyMeta):
-    """A key of a survey file: its place, and what its annotation and its docstring say.
-
-    Flag and expected values are never empty.
-
-    Attributes:
-        table: name of its table, without brackets.
-        name: of the key in that table.
-        type: of the value, without the None that means "not given".
-        meaning: the docstring on one line without its full stop, followed by the default.
-    """
-
-    table: str
-    name: str
-    type: Any
-    meaning: str
+    table: str = ""
+    name: str = ""
+    type: Any = Any
+    meaning: str = ""
 
     @property
     def dotted(self) -> str:
@@ -162,11 +152,10 @@ class Options(BaseModel):
         bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
         keys = {}
         for name, field in sorted(cls.model_fields.items(), key=lambda item: item[0] not in cls.__annotations__):
-            meta = next((item for item in field.metadata if isinstance(item, KeyMeta)), KeyMeta())
+            meta = next((item for item in field.metadata if isinstance(item, Key)), Key())
             if not meta.is_key:
                 continue
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), "")
-            told = {"flag": meta.flag or name, "expected": meta.expected or _described(hints[name], unit)}
             type_ = bare[name]
             if get_origin(type_) in (Union, types.UnionType):
                 type_ = Union[tuple(arg for arg in get_args(type_) if arg is not types.NoneType)]  # noqa: UP007
@@ -176,7 +165,9 @@ class Options(BaseModel):
                 parts = default if isinstance(default, tuple) else (default,)
                 words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
                 meaning += f" (default: {','.join(words)})"
-            keys[name] = Key(**{**vars(meta), **told}, table=cls.table, name=name, type=type_, meaning=meaning)
+            flag, expected = meta.flag or name, meta.expected or _described(hints[name], unit)
+            told = replace(meta, flag=flag, expected=expected, type=type_, meaning=meaning)
+            keys[name] = replace(told, table=cls.table, name=name)
         return keys
 
     @classmethod

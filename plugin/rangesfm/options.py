@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.option_model import Bounds, KeyMeta, Options
+from rangesfm.option_model import Bounds, Key, Options
 
 DEFAULT_FORMATS = ("tum", "ply")
 # Relative stddev of a calibrated focal length: focus, temperature and another calibration board change it by this much.
@@ -97,38 +97,38 @@ _LengthUnit = Literal["m", "cm", "mm", "ft"]
 class ImageOptions(Options, table="images"):
     """The photos. Of the keys that choose keyframes, all that are given apply together."""
 
-    every_nth: Annotated[_Count, KeyMeta(is_common=True)] = 1
+    every_nth: Annotated[_Count, Key(is_common=True)] = 1
     """Use every n-th photo, in order of time."""
     min_interval_s: _Duration = 0.0
     """Shortest time between two keyframes."""
     max_num_keyframes: Annotated[int, Field(ge=3, le=1_000_000)] | None = None
     """Largest number of keyframes; the photos are thinned evenly to it (default: no limit)."""
-    path: Annotated[Path | None, KeyMeta(flag="images", metavar="PATH", role="photos", is_common=True)] = None
+    path: Annotated[Path | None, Key(flag="images", metavar="PATH", role="photos", is_common=True)] = None
     """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
     the photos' times."""
-    model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model", is_common=True)] = None
+    model: Annotated[Path | None, Key(flag="input_path", metavar="MODEL", role="model", is_common=True)] = None
     """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then. Or a trajectory of the
     camera in any unit, to be scaled: a TUM file, or a CSV timestamp_s,x_m,y_m,z_m,qx,qy,qz,qw."""
-    times: Annotated[Path | None, KeyMeta(flag="image_times", role="file", is_common=True)] = None
+    times: Annotated[Path | None, Key(flag="image_times", role="file", is_common=True)] = None
     """CSV image_name,timestamp_s with the times of the photos, or another table of photos and times (default: by
     rate_hz if given, else EXIF, else file names)."""
-    times_columns: Annotated[dict[str, str], KeyMeta(flag="image_times_columns")] = Field(default_factory=dict)
+    times_columns: Annotated[dict[str, str], Key(flag="image_times_columns")] = Field(default_factory=dict)
     """Names of the columns of times (numbers, where they have no names) for image_name, timestamp and possibly date
     and nanoseconds (default: recognised)."""
-    times_unit: Annotated[_TimeUnit | None, KeyMeta(flag="image_times_unit")] = None
+    times_unit: Annotated[_TimeUnit | None, Key(flag="image_times_unit")] = None
     """Unit of the times, as timestamp_unit in [ranges] (default: by column name or values)."""
-    rig_config: Annotated[Path | None, KeyMeta(flag="rig_config_path", metavar="JSON", role="file")] = None
+    rig_config: Annotated[Path | None, Key(flag="rig_config_path", metavar="JSON", role="file")] = None
     """COLMAP's rig_config.json, lengths in metres. Photos of a rig whose names are the same after their image_prefix
     were taken at the same time, that of the reference camera's photo. A given cam_from_rig is kept while mapping, and
     the length of its translation is a measured distance, tested against the ranges; cameras without one are placed by
     a first model made without the rig."""
     baseline_stddev_m: _Positive = 0.001
     """Standard deviation of the known distance of each camera of a rig from the reference camera."""
-    rate_hz: Annotated[Annotated[float, Field(ge=1e-3, le=1e3)] | None, KeyMeta(flag="image_rate_hz")] = None
+    rate_hz: Annotated[Annotated[float, Field(ge=1e-3, le=1e3)] | None, Key(flag="image_rate_hz")] = None
     """Photos per second. From a video or a bag so many are taken, the sharpest image of each interval (default: 2). For
     a folder of photos it is the fixed rate at which they were taken, in the order of the numbers in their names
     (default: the photos have times)."""
-    topic: Annotated[str, KeyMeta(flag="image_topic")] = ""
+    topic: Annotated[str, Key(flag="image_topic")] = ""
     """Topic of the images, for a bag with several image topics."""
 
     @property
@@ -140,15 +140,15 @@ class ImageOptions(Options, table="images"):
 class CameraOptions(Options, table="camera"):
     """The cameras of the photos."""
 
-    images: Annotated[str, KeyMeta(flag="camera_images", metavar="PATTERN")] = ""
+    images: Annotated[str, Key(flag="camera_images", metavar="PATTERN")] = ""
     """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
     as left*.jpg. One table may leave it out, for all other photos."""
-    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], KeyMeta(flag="camera_mode")] = "auto"
+    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Key(flag="camera_mode")] = "auto"
     """Photos of one size that have one camera. auto: those with the same make, model, serial number and focal length in
     EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
-    model: Annotated[str, KeyMeta(flag="camera_model")] = ""
+    model: Annotated[str, Key(flag="camera_model")] = ""
     """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
-    params: Annotated[_Numbers, KeyMeta(flag="camera_params")] = ()
+    params: Annotated[_Numbers, Key(flag="camera_params")] = ()
     """Parameters of the camera model in COLMAP's order, for photos of the most common size; they are rescaled for
     photos of another size and the same shape."""
     focal_length_stddev_px: Uncertainty | None = None
@@ -159,7 +159,7 @@ class CameraOptions(Options, table="camera"):
     """Adjust the camera parameters in mapping and refinement (default: mapping does, given ones only once the map is
     complete; the refinement adjusts given ones within their stddev and keeps all others)."""
 
-    others: Annotated[tuple[CameraOptions, ...], KeyMeta(is_key=False)] = ()
+    others: Annotated[tuple[CameraOptions, ...], Key(is_key=False)] = ()
     """Further [[camera]] tables, each with its pattern. This table is for photos that match none of them."""
 
     @property
@@ -215,9 +215,9 @@ class RangeModelOptions(Options, table="ranges"):
 class RangesOptions(RangeModelOptions):
     """The radio's log, how its ranges are placed on the path, assumptions about its errors, and checks."""
 
-    path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
+    path: Annotated[Path | None, Key(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
-    format: Annotated[str, KeyMeta(flag="ranges_format")] = ""
+    format: Annotated[str, Key(flag="ranges_format")] = ""
     """Format of the log (default: recognised by content)."""
     columns: dict[str, str] = Field(default_factory=dict)
     """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
@@ -229,9 +229,7 @@ class RangesOptions(RangeModelOptions):
     name or values)."""
     range_unit: _LengthUnit | None = None
     """Unit of the log's ranges (default: by format, column name or values)."""
-    separator: Annotated[
-        Annotated[str, Field(max_length=1)], KeyMeta(metavar="CHARACTER", expected="one character")
-    ] = ""
+    separator: Annotated[Annotated[str, Field(max_length=1)], Key(metavar="CHARACTER", expected="one character")] = ""
     """Character between the cells of a row (default: recognised)."""
     ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] = 0.2
     """Time between two ranging rounds, for a Qorvo log without times of the host."""
@@ -241,16 +239,16 @@ class RangesOptions(RangeModelOptions):
     """Number of bits of the counter behind the time stamps; 32 bits count up to 67 ms."""
     propagation_speed: Annotated[
         Literal["air", "vacuum"] | Annotated[float, Field(ge=1e8, le=3e8)],
-        KeyMeta(expected="air, vacuum or a speed of light in m/s"),
+        Key(expected="air, vacuum or a speed of light in m/s"),
     ] = "air"
     """Speed of the radio signal, for ranges computed from time stamps."""
     t_off_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Time that the delays of both devices together add to a round trip, for ranges computed from time stamps."""
-    error_curve: Annotated[Path | None, KeyMeta(role="file")] = None
+    error_curve: Annotated[Path | None, Key(role="file")] = None
     """File with the radio's error by distance, written by rangesfm ranges calibrate."""
     time_offset: Annotated[
         Literal["auto"] | _Time,
-        KeyMeta(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
+        Key(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
     ] = "auto"
     """Time offset between the clocks: image time = range time + offset. auto: it is searched for."""
 
@@ -265,7 +263,7 @@ class RangesOptions(RangeModelOptions):
     check_anchors: _Texts = ()
     """Ids of anchors with surveyed positions; all their ranges are checks."""
     check_times_s: Annotated[
-        _Times, AfterValidator(_span), KeyMeta(metavar="A,B", expected="two times in seconds, the later one last")
+        _Times, AfterValidator(_span), Key(metavar="A,B", expected="two times in seconds, the later one last")
     ] = ()
     """First and last time, on the radio's clock; the ranges between them are checks."""
 
@@ -278,39 +276,39 @@ class RangesOptions(RangeModelOptions):
 class AnchorOptions(Options, table="anchors"):
     """The anchors."""
 
-    path: Annotated[Path | None, KeyMeta(flag="anchors", role="file", is_common=True)] = None
+    path: Annotated[Path | None, Key(flag="anchors", role="file", is_common=True)] = None
     """CSV anchor_id,x_m,y_m,z_m, possibly with position_stddev_m, range_bias_m and range_bias_stddev_m, or another
     table of points or a GSI file; empty coordinates mean an unknown position (default: the anchors in the log, all
     unknown)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="anchor_columns")] = Field(default_factory=dict)
+    columns: Annotated[dict[str, str], Key(flag="anchor_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for anchor_id, x, y, z, position_stddev,
     range_bias and range_bias_stddev; x is east and y north, if they are such (default: recognised)."""
-    unit: Annotated[_LengthUnit | None, KeyMeta(flag="anchor_unit")] = None
+    unit: Annotated[_LengthUnit | None, Key(flag="anchor_unit")] = None
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
-    frame: Annotated[Literal["site", "first_camera", "unknown"] | None, KeyMeta(flag="anchor_frame")] = None
+    frame: Annotated[Literal["site", "first_camera", "unknown"] | None, Key(flag="anchor_frame")] = None
     """Frame of the anchors' coordinates (default: site if the file has any position, else unknown)."""
-    crs: Annotated[str, KeyMeta(flag="anchor_crs")] = ""
+    crs: Annotated[str, Key(flag="anchor_crs")] = ""
     """Coordinate reference system of the anchors' positions, such as EPSG:2056 (default: a local frame in metres)."""
-    use: Annotated[_Texts, KeyMeta(flag="use_anchors")] = ()
+    use: Annotated[_Texts, Key(flag="use_anchors")] = ()
     """Ids of the anchors whose ranges are used (default: all)."""
 
 
 class PointOptions(Options, table="points"):
     """Marks in the photos whose coordinates are known: control points and check points."""
 
-    path: Annotated[Path | None, KeyMeta(flag="points", role="file", is_common=True)] = None
+    path: Annotated[Path | None, Key(flag="points", role="file", is_common=True)] = None
     """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, ODM's
     gcp_list.txt, or Metashape's markers (XML). A control point determines the map, a check point is only compared with
     it. The photos that show them are in that file, in that of [scale] markers, or found (printed tags)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="point_columns")] = Field(default_factory=dict)
+    columns: Annotated[dict[str, str], Key(flag="point_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for marker, x, y, z, stddev and kind; x is
     east and y north, if they are such (default: recognised)."""
-    unit: Annotated[_LengthUnit | None, KeyMeta(flag="point_unit")] = None
+    unit: Annotated[_LengthUnit | None, Key(flag="point_unit")] = None
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
-    crs: Annotated[str, KeyMeta(flag="point_crs")] = ""
+    crs: Annotated[str, Key(flag="point_crs")] = ""
     """Coordinate reference system of the points, such as EPSG:2056 (default: that of gcp_list.txt, else the frame of
     the anchors)."""
-    stddev_m: Annotated[_Positive, KeyMeta(flag="point_stddev_m")] = 0.01
+    stddev_m: Annotated[_Positive, Key(flag="point_stddev_m")] = 0.01
     """Standard deviation of each coordinate of a point for which the file has none. Its order of magnitude is enough,
     as it is estimated with the map."""
 
@@ -318,40 +316,40 @@ class PointOptions(Options, table="points"):
 class PositionOptions(Options, table="positions"):
     """Positions of an antenna on the camera: by satellites, by a radio that hands out positions, or a total station."""
 
-    path: Annotated[Path | None, KeyMeta(flag="positions", role="file_or_photos")] = None
+    path: Annotated[Path | None, Key(flag="positions", role="file_or_photos")] = None
     """CSV timestamp_s,x_m,y_m,z_m[,stddev_m] (or image_name in place of timestamp_s; stddev_x_m, stddev_y_m and
     stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
     of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors; or the folder of photos, for
     those in their EXIF data."""
-    format: Annotated[str, KeyMeta(flag="positions_format")] = ""
+    format: Annotated[str, Key(flag="positions_format")] = ""
     """Format of the file: table, tum, nmea, rtklib, marvelmind or colmap (default: recognised by content)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="position_columns")] = Field(default_factory=dict)
+    columns: Annotated[dict[str, str], Key(flag="position_columns")] = Field(default_factory=dict)
     """Names of the columns of a table (numbers, where they have no names) for timestamp or image_name, x, y, z, and
     possibly stddev (or stddev_x, stddev_y, stddev_z) and tag_id (default: recognised)."""
-    timestamp_unit: Annotated[_TimeUnit | None, KeyMeta(flag="position_time_unit")] = None
+    timestamp_unit: Annotated[_TimeUnit | None, Key(flag="position_time_unit")] = None
     """Unit of the times, as timestamp_unit in [ranges] (default: by column name or values)."""
-    unit: Annotated[_LengthUnit | None, KeyMeta(flag="position_unit")] = None
+    unit: Annotated[_LengthUnit | None, Key(flag="position_unit")] = None
     """Unit of the coordinates (default: that in the names of the columns, else m)."""
-    crs: Annotated[str, KeyMeta(flag="position_crs")] = ""
+    crs: Annotated[str, Key(flag="position_crs")] = ""
     """Coordinate reference system of the positions, such as EPSG:2056 (default: that of the format, else the frame of
     anchors and points)."""
-    tag_id: Annotated[str, KeyMeta(flag="position_tag_id")] = ""
+    tag_id: Annotated[str, Key(flag="position_tag_id")] = ""
     """Id of the tag on the camera, for a file with positions of several."""
-    antenna_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="antenna_in_cam", metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
+    antenna_in_cam_m: Annotated[_LeverArm, Key(flag="antenna_in_cam", metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
     """Lever arm: position of the antenna, or of the prism, in the camera frame (right, down, forward), metres."""
     time_offset: Annotated[
         Literal["auto"] | _Time,
-        KeyMeta(
+        Key(
             flag="positions_time_offset",
             metavar="auto|SECONDS",
             expected='"auto" or seconds, at most 1e+10 of them',
         ),
     ] = "auto"
     """Time offset between the clocks: image time = time of the position + offset. auto: it is searched for."""
-    stddev_m: Annotated[_Positive | None, KeyMeta(flag="position_stddev_m")] = None
+    stddev_m: Annotated[_Positive | None, Key(flag="position_stddev_m")] = None
     """Standard deviation of each coordinate of the positions, in place of what the file says of it (default: as the
     file says; in both cases it is estimated with the map)."""
-    lasting_s: Annotated[Annotated[float, Field(ge=1e-2, le=1e5)] | None, KeyMeta(flag="position_lasting_s")] = None
+    lasting_s: Annotated[Annotated[float, Field(ge=1e-2, le=1e5)] | None, Key(flag="position_lasting_s")] = None
     """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s, learnt with the map)."""
 
     @property
@@ -363,20 +361,20 @@ class PositionOptions(Options, table="positions"):
 class ImuOptions(Options, table="imu"):
     """The log of an inertial sensor (IMU) that is fixed to the camera: of a phone, an action camera or a rig."""
 
-    path: Annotated[Path | None, KeyMeta(flag="imu", metavar="PATH", role="log")] = None
+    path: Annotated[Path | None, Key(flag="imu", metavar="PATH", role="log")] = None
     """CSV timestamp_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2, another table with
     the rates and accelerations of three axes, the folder or zip archive of a phone's recording, or a ROS bag."""
     rotation_imu_to_cam_xyzw: Annotated[
         Annotated[_Four, AfterValidator(_unit_quaternion)] | None,
-        KeyMeta(metavar="X,Y,Z,W", expected="a list of 4 numbers: a quaternion x, y, z, w of length 1"),
+        Key(metavar="X,Y,Z,W", expected="a list of 4 numbers: a quaternion x, y, z, w of length 1"),
     ] = None
     """Rotation that takes the sensor's axes to the camera's (right, down, forward). It is compared with the turns of
     the photos (default: found from these)."""
-    imu_in_cam_m: Annotated[_LeverArm | None, KeyMeta(flag="imu_in_cam", metavar="X,Y,Z")] = None
+    imu_in_cam_m: Annotated[_LeverArm | None, Key(flag="imu_in_cam", metavar="X,Y,Z")] = None
     """Lever arm: position of the sensor in the camera frame (right, down, forward), metres (default: at the camera)."""
     time_offset: Annotated[
         Literal["auto"] | _Time,
-        KeyMeta(
+        Key(
             flag="imu_time_offset",
             metavar="auto|SECONDS",
             expected='"auto" or seconds, at most 1e+10 of them',
@@ -384,7 +382,7 @@ class ImuOptions(Options, table="imu"):
     ] = "auto"
     """Time offset between the clocks: image time = time of the log + offset. auto: found from the turns of the photos,
     with which a given one is compared."""
-    noise: Annotated[Path | None, KeyMeta(flag="imu_noise", metavar="YAML", role="file")] = None
+    noise: Annotated[Path | None, Key(flag="imu_noise", metavar="YAML", role="file")] = None
     """Kalibr's imu.yaml, with the densities of the sensor's noise (default: learnt)."""
 
     @property
@@ -396,14 +394,14 @@ class ImuOptions(Options, table="imu"):
 class TagOptions(Options, table="tag"):
     """The radio tag on the camera, or several tags."""
 
-    tag_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="tag_in_cam", metavar="[ID:]X,Y,Z", is_common=True)] = (
+    tag_in_cam_m: Annotated[_LeverArm, Key(flag="tag_in_cam", metavar="[ID:]X,Y,Z", is_common=True)] = (
         0.0,
         0.0,
         0.0,
     )
     """Lever arm: position of the tag's antenna in the camera frame (right, down, forward), metres; with a rig, in the
     frame of its reference camera. With several tags, give the flag once for each, with the tag's ID."""
-    lever_arms_m: Annotated[dict[str, _LeverArm], KeyMeta(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
+    lever_arms_m: Annotated[dict[str, _LeverArm], Key(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
         default_factory=dict
     )
     """Lever arms by tag id, for a camera with several tags."""
@@ -421,7 +419,7 @@ class TagOptions(Options, table="tag"):
 class ScaleOptions(Options, table="scale"):
     """The estimate of the scale, and distances taped on the site."""
 
-    method: Annotated[Literal["robust", "two-candidate", "two-candidate-unchecked"], KeyMeta(flag="scale_method")] = (
+    method: Annotated[Literal["robust", "two-candidate", "two-candidate-unchecked"], Key(flag="scale_method")] = (
         "robust"
     )
     """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper, for
@@ -431,7 +429,7 @@ class ScaleOptions(Options, table="scale"):
     """Largest accepted relative standard deviation of the scale; a scale that is less certain is refused."""
     up_in_first_camera: Annotated[
         Annotated[_Three, AfterValidator(_direction)] | None,
-        KeyMeta(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
+        Key(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
     ] = None
     """Upward direction in the camera frame of the first keyframe, of any length; 0,-1,0 if the camera was level. With
     it, two anchors with site coordinates are enough, and a mirror image that puts the map upside down is ruled out."""
@@ -440,9 +438,9 @@ class ScaleOptions(Options, table="scale"):
     adopt: bool = False
     """Run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown, the lever
     arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
-    distances: Annotated[Path | None, KeyMeta(role="file", is_common=True)] = None
+    distances: Annotated[Path | None, Key(role="file", is_common=True)] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
-    markers: Annotated[Path | None, KeyMeta(role="file")] = None
+    markers: Annotated[Path | None, Key(role="file")] = None
     """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped, or
     whose coordinates are in [points]."""
 
@@ -450,13 +448,13 @@ class ScaleOptions(Options, table="scale"):
 class MarkerOptions(Options, table="markers"):
     """Printed tags of known size in the photos."""
 
-    dictionary: Annotated[TagDictionary | None, KeyMeta(flag="marker_dictionary", metavar="NAME")] = None
+    dictionary: Annotated[TagDictionary | None, Key(flag="marker_dictionary", metavar="NAME")] = None
     """Dictionary of the printed tags, by OpenCV's name. The corners of tag 7 are the markers tag7.0 (upper left of the
     upright tag) to tag7.3, clockwise (default: no tags are looked for)."""
-    side_m: Annotated[_Positive | None, KeyMeta(flag="marker_side_m")] = None
+    side_m: Annotated[_Positive | None, Key(flag="marker_side_m")] = None
     """Side of the tags, from black corner to black corner. Each tag found gives four known lengths (default: none; the
     corners only serve as ends of taped distances)."""
-    side_stddev_m: Annotated[_Positive, KeyMeta(flag="marker_side_stddev_m")] = 0.0005
+    side_stddev_m: Annotated[_Positive, Key(flag="marker_side_stddev_m")] = 0.0005
     """Standard deviation of the side; the error is the same for all tags."""
 
     @model_validator(mode="after")
@@ -469,7 +467,7 @@ class MarkerOptions(Options, table="markers"):
 class RefineOptions(Options, table="refine"):
     """Bundle adjustment with the ranges."""
 
-    enabled: Annotated[bool, KeyMeta(flag="refine")] = True
+    enabled: Annotated[bool, Key(flag="refine")] = True
     """Refine the map after it is scaled."""
     max_num_iterations: Annotated[int, Field(ge=0, le=1_000_000)] = 200
     """Largest number of iterations of the solver."""
@@ -494,23 +492,23 @@ class RefineOptions(Options, table="refine"):
 class ExportOptions(Options, table="export"):
     """The metric model in other formats, and the frame of the exported files."""
 
-    formats: Annotated[_Texts, KeyMeta(is_common=True)] = DEFAULT_FORMATS
+    formats: Annotated[_Texts, Key(is_common=True)] = DEFAULT_FORMATS
     """Names of export formats; the message about an unknown name lists them all."""
-    frame: Annotated[Literal["result", "level", "enu"], KeyMeta(flag="export_frame")] = "result"
+    frame: Annotated[Literal["result", "level", "enu"], Key(flag="export_frame")] = "result"
     """Frame of the exported files. result: that of the result (site or first camera); level: z up, y along the first
     camera's view unless it is in the site, the origin near the cameras if it is far from them; enu: x east, y north,
     z up, which needs a georeferenced map."""
     up: str = "auto"
     """Upward direction, for the frames level and enu. cameras: mean upward direction of the photos; path: perpendicular
     to the plane of the path; X,Y,Z: a direction in the result's frame; auto: z in a site frame, else as cameras."""
-    crs: Annotated[str, KeyMeta(flag="export_crs")] = ""
+    crs: Annotated[str, Key(flag="export_crs")] = ""
     """Coordinate reference system of LAZ and GeoPackage files, such as EPSG:2056 (default: that of the anchors, else
     longitude and latitude)."""
     origin_anchor: str = ""
     """Id of an anchor whose geographic position is known."""
     origin_lat_lon_height: Annotated[
         _Place | None,
-        KeyMeta(
+        Key(
             metavar="LAT,LON,H",
             expected="3 numbers: latitude up to 90 and longitude up to 360 degrees, height up to 1e+05 metres",
         ),
@@ -523,20 +521,20 @@ class ExportOptions(Options, table="export"):
 class ReportOptions(Options, table="report"):
     """The report, and true positions to compare the result with."""
 
-    reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file", is_common=True)] = None
+    reference: Annotated[Path | None, Key(metavar="FILE", role="file", is_common=True)] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
-    title: Annotated[str, KeyMeta(flag="report_title", metavar="TEXT")] = ""
+    title: Annotated[str, Key(flag="report_title", metavar="TEXT")] = ""
     """Title of the report. Without one it is the name of the folder."""
-    by: Annotated[str, KeyMeta(flag="report_by", metavar="TEXT")] = ""
+    by: Annotated[str, Key(flag="report_by", metavar="TEXT")] = ""
     """Who made the survey, for the report."""
-    enabled: Annotated[bool, KeyMeta(flag="report")] = True
+    enabled: Annotated[bool, Key(flag="report")] = True
     """Write report.html."""
 
 
 class OutputOptions(Options, table="output"):
     """The folder of the results, and the seed."""
 
-    path: Annotated[Path, KeyMeta(flag="output_path", role="output", is_common=True)] = Path("out")
+    path: Annotated[Path, Key(flag="output_path", role="output", is_common=True)] = Path("out")
     """Folder of the results."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
     """Seed of everything random: the same model and ranges give the same result with it, and so do photos with

@@ -87,7 +87,7 @@ def imu_log(
         offset_s: image time minus time of the log.
     """
     times_s = np.arange(0.0, until_s, 1 / rate_hz)
-    log = simulate_imu(motion, times_s, rate_hz, grade, np.random.default_rng(seed))
+    log = simulate_imu(motion.world_from_imu, motion.places_m, times_s, rate_hz, grade, np.random.default_rng(seed))
     gyro_zero, accel_zero = ZEROS if grade is CONSTANT else np.zeros((2, 3))
     gyro_rad_s, accel_m_s2 = log.gyro_rad_s + gyro_zero, log.accel_m_s2 + accel_zero
     return ImuLog(times_s - offset_s, gyro_rad_s, accel_m_s2, "imu.csv")

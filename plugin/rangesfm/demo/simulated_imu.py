@@ -2,52 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS
 from rangesfm.measurements.imu.log import ImuLog
 
 GRAVITY_M_S2 = 9.81
 _STEP_S = 1e-3  # over which a motion is differentiated
-
-
-class ImuMotion(Protocol):
-    """Motion of a sensor in a world whose z is up. Its acceleration is continuous.
-
-    Times near zero are exact enough to be differentiated twice; those since 1970 are not.
-    """
-
-    def world_from_imu(self, times_s: Array) -> Rotation:
-        """Return the n rotations at (n,) times."""
-
-    def places_m(self, times_s: Array) -> Array:
-        """Return the (n, 3) places at (n,) times."""
-
-
-@dataclass(frozen=True)
-class OnCamera:
-    """Motion of a sensor that is fixed to a camera.
-
-    Attributes:
-        camera: its path, in a world whose z is up.
-        cam_from_imu: (3, 3) rotation. imu_in_cam_m: (3,) lever arm.
-    """
-
-    camera: CameraPath
-    cam_from_imu: Array
-    imu_in_cam_m: Array
-
-    def world_from_imu(self, times_s: Array) -> Rotation:
-        return Rotation.from_matrix(self.camera.world_from_cam(times_s) @ self.cam_from_imu)
-
-    def places_m(self, times_s: Array) -> Array:
-        return self.camera.centers(times_s) + self.camera.world_from_cam(times_s) @ self.imu_in_cam_m
 
 
 @dataclass(frozen=True)
@@ -75,12 +41,25 @@ class Grade:
 PHONE = Grade(2e-4, 3e-3, 0.015, 0.1, 1e-5, 5e-4)
 
 
-def simulate_imu(motion: ImuMotion, times_s: Array, rate_hz: float, grade: Grade, rng: np.random.Generator) -> ImuLog:
-    """Return what a sensor measures at the (k,) times of its samples, which are evenly spaced by ``rate_hz``."""
+def simulate_imu(
+    world_from_imu: Callable[[Array], Rotation],
+    places_m: Callable[[Array], Array],
+    times_s: Array,
+    rate_hz: float,
+    grade: Grade,
+    rng: np.random.Generator,
+) -> ImuLog:
+    """Return what a sensor measures on its way through a world whose z is up.
+
+    Args:
+        world_from_imu: returns its k rotations at (k,) times. places_m: returns its (k, 3) places. Both are
+            differentiated, for which times near zero are exact enough, and those since 1970 are not.
+        times_s: (k,) of its samples, which are evenly spaced by ``rate_hz``.
+    """
     h = _STEP_S
-    now = motion.world_from_imu(times_s)
-    gyro = (motion.world_from_imu(times_s - h).inv() * motion.world_from_imu(times_s + h)).as_rotvec() / (2 * h)
-    later, here, before = (motion.places_m(times_s + k * h) for k in (1, 0, -1))
+    now = world_from_imu(times_s)
+    gyro = (world_from_imu(times_s - h).inv() * world_from_imu(times_s + h)).as_rotvec() / (2 * h)
+    later, here, before = (places_m(times_s + k * h) for k in (1, 0, -1))
     force = now.inv().apply((later - 2 * here + before) / h**2 + np.array([0.0, 0.0, GRAVITY_M_S2]))
     walked = rng.normal(size=(2, *gyro.shape)).cumsum(axis=1) / np.sqrt(rate_hz)
     zeros, scales = rng.normal(size=(2, 2, 3))

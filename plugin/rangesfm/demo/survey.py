@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.demo.simulated_imu import PHONE, OnCamera, imu_table, simulate_imu
+from rangesfm.demo.simulated_imu import PHONE, imu_table, simulate_imu
 from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
 from rangesfm.measurements.imu.log import ImuLog
@@ -188,10 +188,16 @@ def simulate_phone(times_s: Array, centers_m: Array, world_from_cam: Array, seed
         times_s: (n,) on the camera's clock. centers_m: (n, 3) in a world whose z is up. world_from_cam: (n, 3, 3).
     """
     camera = CameraPath.through(times_s - times_s[0], centers_m, world_from_cam)
-    motion = OnCamera(camera, CAM_FROM_IMU, np.array(IMU_IN_CAM_M))
+
+    def world_from_imu(times_s: Array) -> Rotation:
+        return Rotation.from_matrix(camera.world_from_cam(times_s) @ CAM_FROM_IMU)
+
+    def places_m(times_s: Array) -> Array:
+        return np.asarray(camera.centers(times_s) + camera.world_from_cam(times_s) @ np.array(IMU_IN_CAM_M))
+
     # Differences are taken around each sample: the spline ends at the first and the last pose.
     samples_s = np.arange(1, int(camera.end_s * _IMU_RATE_HZ)) / _IMU_RATE_HZ
-    log = simulate_imu(motion, samples_s, _IMU_RATE_HZ, PHONE, np.random.default_rng([seed, 2]))
+    log = simulate_imu(world_from_imu, places_m, samples_s, _IMU_RATE_HZ, PHONE, np.random.default_rng([seed, 2]))
     return replace(log, timestamp_s=times_s[0] + samples_s - IMU_TIME_OFFSET_S)
 
 

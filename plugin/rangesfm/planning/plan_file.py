@@ -17,7 +17,7 @@ from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.errors.components import COMPONENTS, LOGS, stddevs_in
-from rangesfm.option_model import KeyMeta, Options
+from rangesfm.option_model import Key, Options
 from rangesfm.options import LENGTH_M, PointOptions, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
@@ -49,16 +49,16 @@ def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tupl
 
 
 _Heights = Annotated[tuple[Coordinate, Coordinate], Field(strict=False), AfterValidator(ascending)]
-_HEIGHTS = KeyMeta(expected="a list of 2 numbers, the larger one last")
+_HEIGHTS = Key(expected="a list of 2 numbers, the larger one last")
 _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
 
 class PlannedAnchorOptions(Options, table="anchors"):
     """Planned anchors: their places in the site, in metres, z up."""
 
-    path: Annotated[Path | None, KeyMeta(role="file")] = None
+    path: Annotated[Path | None, Key(role="file")] = None
     """CSV file anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], each with a position."""
-    places: Annotated[dict[str, Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = Field(
+    places: Annotated[dict[str, Place], Key(expected="a table in which each value is a list of 3 numbers")] = Field(
         default_factory=dict
     )
     """Positions x, y, z by anchor id, instead of path."""
@@ -70,12 +70,12 @@ class PlannedAnchorOptions(Options, table="anchors"):
     """Number of anchors to place where they help most, in the region or on the walls, instead of places and path."""
     region_m: Annotated[
         Annotated[tuple[Place, Place], Field(strict=False), AfterValidator(_corners)] | None,
-        KeyMeta(expected="two places, the second one in no coordinate smaller"),
+        Key(expected="two places, the second one in no coordinate smaller"),
     ] = None
     """Two opposite corners x, y, z of the box in which anchors may be placed."""
     walls_m: Annotated[
         Annotated[tuple[_Corners, ...], Field(strict=False)] | None,
-        KeyMeta(expected="a list of walls, each a list of 2 corners x, y or more"),
+        Key(expected="a list of walls, each a list of 2 corners x, y or more"),
     ] = None
     """Walls on which anchors may be placed instead, at heights_m: each a list of corners x, y as seen from above."""
     heights_m: Annotated[_Heights | None, _HEIGHTS] = None
@@ -86,12 +86,12 @@ class PlannedPathOptions(Options, table="path"):
     """Planned path of the camera: waypoints, a loop, a trajectory, or a model."""
 
     waypoints: Annotated[
-        Annotated[tuple[Place, ...], Field(strict=False)] | None, KeyMeta(expected="a list of lists of 3 numbers")
+        Annotated[tuple[Place, ...], Field(strict=False)] | None, Key(expected="a list of lists of 3 numbers")
     ] = None
     """Points x, y, z in the site that the camera passes; it looks ahead, and its path is rounded off at corners."""
     loop_inside_m: Annotated[
         Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
-        KeyMeta(expected="a list of 3 corners x, y or more"),
+        Key(expected="a list of 3 corners x, y or more"),
     ] = None
     """Corners of a floor instead; a loop two thirds as wide is walked in it, up and down between heights_m."""
     heights_m: Annotated[_Heights, _HEIGHTS] = (1.2, 2.0)
@@ -102,9 +102,9 @@ class PlannedPathOptions(Options, table="path"):
     """Angular velocity with which the camera turns in the sharpest corner."""
     num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of times that they are walked; each further round starts by going back to the first waypoint."""
-    file: Annotated[Path | None, KeyMeta(role="file")] = None
+    file: Annotated[Path | None, Key(role="file")] = None
     """A recorded trajectory instead, TUM or CSV, with rotations."""
-    model: Annotated[Path | None, KeyMeta(role="model")] = None
+    model: Annotated[Path | None, Key(role="model")] = None
     """A metric COLMAP model in the site's frame instead, its photos in the order of their names."""
     photo_rate_hz: Annotated[float, Field(ge=0.5, le=100)] = 2.0
     """Keyframes per second."""
@@ -115,9 +115,9 @@ class PlannedPathOptions(Options, table="path"):
 class PlannedPointOptions(Options, table="points"):
     """Planned control points: marks whose coordinates in the site will be known, beside anchors or without any."""
 
-    path: Annotated[Path | None, KeyMeta(role="file")] = None
+    path: Annotated[Path | None, Key(role="file")] = None
     """CSV file marker,x_m,y_m,z_m[,stddev_m,kind]."""
-    places: Annotated[dict[str, Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = Field(
+    places: Annotated[dict[str, Place], Key(expected="a table in which each value is a list of 3 numbers")] = Field(
         default_factory=dict
     )
     """Coordinates x, y, z of control points by name, instead of path. Photos must show them ([photos], its defaults

@@ -23,7 +23,7 @@ from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.known_marks import locate_points
 from rangesfm.measurements.positions.known_positions import KnownPositions
-from rangesfm.option_model import KeyMeta, Options
+from rangesfm.option_model import Key, Options
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -54,7 +54,7 @@ class PlannedPhotos(Options, table="photos"):
     """Horizontal field of view."""
     seen_m: Annotated[
         Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(ascending)],
-        KeyMeta(expected="a list of 2 distances, the larger one last"),
+        Key(expected="a list of 2 distances, the larger one last"),
     ] = (1.5, 8.0)
     """Distances of the nearest and the farthest points that the camera sees, in metres."""
     num_points: Annotated[int, Field(ge=8, le=100_000)] = 200
