@@ -21,12 +21,12 @@ import rangesfm
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.progress import Progress
+from rangesfm.sfm.background import match_share
 from rangesfm.sfm.camera import cameras_of_photos
 from rangesfm.sfm.features import feature_options
 from rangesfm.sfm.loops.resection import resection_options
 from rangesfm.sfm.mapping import WHILE_GROWING, mapping_options, pipeline_options
 from rangesfm.sfm.matching import matching_options
-from rangesfm.sfm.own_process import match_share
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.rigs import NO_RIGS
 from rangesfm.solver.bundle_adjustment import bundle_adjustment

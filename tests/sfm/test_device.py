@@ -12,10 +12,10 @@ from rangesfm.errors import OptionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
 from rangesfm.progress import Progress
+from rangesfm.sfm.background import find_features, match_share
 from rangesfm.sfm.features import feature_options
 from rangesfm.sfm.mapping import pipeline_options
 from rangesfm.sfm.matching import matching_options
-from rangesfm.sfm.own_process import find_features, match_share
 
 NUM_CORES = 3
 SILENT = Progress()

@@ -11,9 +11,9 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import Progress
+from rangesfm.sfm.background import find_features
 from rangesfm.sfm.database import num_photos_with_features
 from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
-from rangesfm.sfm.own_process import find_features
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS, Photos
 from rangesfm.util.processes.supervision import run_child
 

@@ -20,7 +20,7 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError, shown
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
-from rangesfm.sfm.background import run_in_background
+from rangesfm.sfm.background import WholePipelineOptions, map_at_once, run_in_background, run_program
 from rangesfm.sfm.database import num_matching_pairs
 from rangesfm.sfm.device import uses_gpu
 from rangesfm.sfm.incremental_mapping import (
@@ -30,7 +30,6 @@ from rangesfm.sfm.incremental_mapping import (
     newest_snapshot,
     snapshots,
 )
-from rangesfm.sfm.own_process import WholePipelineOptions, map_at_once, run_program
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.rigs import Rigs
 from rangesfm.sfm.steps import DATABASE_NAME, MODELS_NAME, Workspace

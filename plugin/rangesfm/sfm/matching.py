@@ -17,10 +17,9 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import Progress
-from rangesfm.sfm.background import run_in_background
+from rangesfm.sfm.background import match_share, run_in_background
 from rangesfm.sfm.database import copy_matches, copy_photos, num_matching_pairs, remove_database
 from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
-from rangesfm.sfm.own_process import match_share
 from rangesfm.sfm.pairs import NamedPairs, PairingOptions, pairing_options, pairs_to_match
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.util.files.atomic import scratch_folder

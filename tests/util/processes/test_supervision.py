@@ -14,7 +14,7 @@ import pytest
 from tests.traps import set_traps
 
 from rangesfm.batch.survey_process import run_in_batch
-from rangesfm.sfm.own_process import find_features
+from rangesfm.sfm.background import find_features
 from rangesfm.util.processes.draw_pictures import _draw
 from rangesfm.util.processes.supervision import Ended, call_by_name, supervise
 
