@@ -9,7 +9,7 @@ World: metres, x and y along the walls, z up, with the origin in a corner of the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -19,8 +19,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
-from rangesfm.demo.survey import TAG_IN_CAM_M, TIME_OFFSET_S, DemoSurvey, simulate_phone, write_demo
+from rangesfm.demo.simulated_radio import CameraPath, simulate_ranges
+from rangesfm.demo.survey import RADIO, TAG_IN_CAM_M, DemoSurvey, simulate_phone, write_demo
 from rangesfm.util.geometry.reference import Reference
 
 NUM_PHOTOS = 96
@@ -38,16 +38,7 @@ _START_S = 1778768427.0  # seconds since 1970
 _TEXEL_M = 0.01
 _SPOTS = ((64, 0.10), (24, 0.12), (9, 0.14), (4, 0.10))  # sizes in texels and contrasts of the spots on the walls
 _NOISE = 0.02  # of a pixel, white is 1
-_RADIO = Radio(
-    rate_hz=8.0,
-    range_stddev_m=0.06,
-    range_bias_m={"A1": 0.05},
-    obstructed_share=0.10,
-    obstructed_mean_m=0.8,
-    lost_share=0.05,
-    time_offset_s=TIME_OFFSET_S,
-    resolution_m=0.001,
-)
+_RADIO = replace(RADIO, range_bias_m={"A1": 0.05})
 
 
 def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0, imu: bool = False) -> DemoSurvey:

@@ -48,7 +48,7 @@ TIME_OFFSET_S = 2.35
 
 # The radio is on before the first photo and after the last, for this number of rows of ``path.csv``, one a second.
 NUM_ROWS_AROUND = 3
-_RADIO = Radio(
+RADIO = Radio(
     rate_hz=8.0,
     range_stddev_m=0.06,
     range_bias_m={"A1": 0.08, "A2": 0.04, "A3": 0.06, "A4": 0.08, "A5": 0.05},
@@ -176,7 +176,7 @@ def _plan(folder: Path, num_photos: int, seed: int, imu: bool = False) -> DemoSu
         timestamps_s=times[taken],
         centers_m=centers[taken] + CORNER_IN_SITE_M,
         world_from_cam=world_from_cam[taken],
-        ranges=simulate_ranges(path, IN_YARD_M, TAG_IN_CAM_M, _RADIO, seed),
+        ranges=simulate_ranges(path, IN_YARD_M, TAG_IN_CAM_M, RADIO, seed),
         imu=simulate_phone(times, centers, world_from_cam, seed) if imu else None,
     )
 
