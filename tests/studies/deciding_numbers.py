@@ -5,7 +5,8 @@ Run: python -m tests.studies.deciding_numbers [--rooms measurements solver ...] 
 A number is a constant at the top of a module, or one of a mapping or a tuple there. Each is doubled alone, wherever it
 was imported to, and five small surveys are run again: a hall with a radio from the population and photos; a lap that
 drifts by 2 m with one anchor; poses without points; a yard with ranges, positions and control points; and a room with
-control points alone. What other constants or default arguments were computed from it at import stays.
+control points alone. A survey that never comes to a line that reads the number is not run again: it cannot change.
+What other constants or default arguments were computed from it at import stays.
 
 Prints the numbers that move a result, those that move most first: the largest change of a scale in its stddevs, the
 largest change of a half width (ratio), of a keyframe's place in the map's stated stddevs, and verdicts that change or
@@ -17,19 +18,24 @@ from __future__ import annotations
 
 import argparse
 import ast
+import dis
 import importlib
+import inspect
 import json
 import pkgutil
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 from tests.simulated.runs import run_stages
-from tests.simulated.surveys import simulated
+from tests.simulated.surveys import Kind, simulated
 from tests.studies import drifting_maps, known_positions
 from tests.studies.measured_distances import KINDS
 
@@ -46,26 +52,22 @@ Number = tuple[str, str, str]
 def surveys() -> dict[str, Callable[[], MetricResult]]:
     """Functions that run a survey, by name."""
 
-    def known(names: str, kind: str) -> Callable[[], MetricResult]:
-        truth, survey = simulated(replace(KINDS[kind], anchor_frame="site"), 0)
-        of_survey = known_positions.Known.of(names.split("+"), truth, survey, KINDS[kind].path(0), 0)
+    def known(names: str, kind: Kind) -> Callable[[], MetricResult]:
+        truth, survey = simulated(replace(kind, anchor_frame="site"), 0)
+        of_survey = known_positions.Known.of(names.split("+"), truth, survey, kind.path(0), 0)
         return lambda: of_survey.run(of_survey.surveyed, 0)
 
+    hall, yard = (replace(KINDS[name], interval_s=1.5, rate_hz=2.0) for name in ("hall", "yard"))
+    lap = partial(drifting_maps.lap_of_drift, 2.0, 0)
     made = {
-        "hall": drifting_maps.hall(0),
-        "lap": drifting_maps.lap_of_drift(2.0, 0, num_keyframes=100),
-        "poses": drifting_maps.without_points(
-            drifting_maps.lap_of_drift(2.0, 0, "site", with_radio=True, num_keyframes=100)
-        ),
-    }
-    found: dict[str, Callable[[], MetricResult]] = {
-        name: lambda survey=survey: run_stages(survey, 0)  # type: ignore[misc]
-        for name, survey in made.items()
+        "hall": simulated(hall, 0)[1],
+        "lap": lap(num_keyframes=100),
+        "poses": drifting_maps.without_points(lap("site", with_radio=True, num_keyframes=40)),
     }
     return {
-        **found,
-        "all": known("points+positions+ranges+anchors", "yard"),
-        "points": known("points", "room"),
+        **{name: partial(run_stages, survey, 0) for name, survey in made.items()},
+        "all": known("points+positions+ranges+anchors", yard),
+        "points": known("points", KINDS["room"]),
     }
 
 
@@ -97,12 +99,59 @@ def doubled(number: Number) -> Line:
     """Return the modules' attributes to be patched, by module and name."""
     module, name, key = number
     value = getattr(sys.modules[module], name)
-    twice = {**value, key: 2 * value[key]} if key else 2 * value
+    twice = {each: 2 * one if str(each) == key else one for each, one in value.items()} if key else 2 * value
     return {
         f"{each}.{name}": twice
         for each, at in list(sys.modules.items())
-        if each.startswith("rangesfm.") and getattr(at, name, None) is value
+        if each.startswith("rangesfm.") and getattr(at, name, None) is value and (each == module or imports(at, name))
     }
+
+
+@cache
+def imports(module: ModuleType, name: str) -> bool:
+    """Return whether the module has the name from another one, rather than defining a number of its own by it."""
+    nodes = ast.walk(ast.parse(inspect.getsource(module)))
+    return any(one.name == name for node in nodes if isinstance(node, ast.ImportFrom) for one in node.names)
+
+
+class Reads:
+    """Record which attributes of the package's modules are read, as names with their modules, while it is entered."""
+
+    def __init__(self) -> None:
+        self.read: set[str] = set()
+        self._to_come: dict[CodeType, dict[int, set[str]]] = {}
+
+    def __enter__(self) -> Reads:
+        threading.settrace(self._calls)
+        sys.settrace(self._calls)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.settrace(None)
+        threading.settrace(None)
+
+    def _calls(self, frame: FrameType, event: str, arg: object) -> Callable[..., Any] | None:
+        module = str(frame.f_globals.get("__name__"))
+        if not module.startswith("rangesfm."):
+            return None
+        if frame.f_code not in self._to_come:
+            self._to_come[frame.f_code] = dict(lines_that_read(frame.f_code, module))
+        return self._lines if self._to_come[frame.f_code] else None
+
+    def _lines(self, frame: FrameType, event: str, arg: object) -> Callable[..., Any] | None:
+        lines = self._to_come[frame.f_code]
+        self.read |= lines.pop(frame.f_lineno, set())
+        return self._lines if lines else None
+
+
+def lines_that_read(code: CodeType, module: str) -> dict[int, set[str]]:
+    """Return the module's attributes that each line of the code reads."""
+    found: dict[int, set[str]] = {}
+    for instruction in dis.get_instructions(code):
+        line = instruction.positions.lineno if instruction.positions is not None else None
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME") and line is not None:
+            found.setdefault(line, set()).add(f"{module}.{instruction.argval}")
+    return found
 
 
 def compared(before: MetricResult, after: MetricResult) -> Line:
@@ -120,10 +169,16 @@ def compared(before: MetricResult, after: MetricResult) -> Line:
     }
 
 
-def effect(number: Number, runs: Mapping[str, Callable[[], MetricResult]], usual: Mapping[str, MetricResult]) -> Line:
-    """Return the largest changes over the surveys, with the number doubled."""
-    changes, said = [], []
-    patches = [patch(at, twice) for at, twice in doubled(number).items()]
+def effect(
+    number: Number,
+    runs: Mapping[str, Callable[[], MetricResult]],
+    usual: Mapping[str, MetricResult],
+    read: Mapping[str, set[str]],
+) -> Line:
+    """Return the largest changes over the surveys that read the number, with the number doubled."""
+    changes, said, twice_by_name = [], [], doubled(number)
+    runs = {name: run for name, run in runs.items() if read[name] & twice_by_name.keys()}
+    patches = [patch(at, twice) for at, twice in twice_by_name.items()]
     for each in patches:
         each.start()
     try:
@@ -141,6 +196,7 @@ def effect(number: Number, runs: Mapping[str, Callable[[], MetricResult]], usual
     widths = [change["half_width"] for change in changes] or [1.0]
     return {
         "number": list(number),
+        "read_by": list(runs),
         "scale": max((change["scale"] for change in changes), default=0.0),
         "half_width": max(widths, key=lambda ratio: abs(np.log(ratio))),
         "place": max((change["place"] for change in changes), default=0.0),
@@ -160,11 +216,15 @@ def main() -> int:
     known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
     lines = [json.loads(line) for line in known]
     done, runs = {tuple(line["number"]) for line in lines}, surveys()
-    usual = {name: run() for name, run in runs.items()}
+    usual, read = {}, {}
+    for name, run in runs.items():
+        with Reads() as reads:
+            usual[name] = run()
+        read[name] = reads.read
     for number in numbers(tuple(args.rooms)):
         if number in done:
             continue
-        lines.append(effect(number, runs, usual))
+        lines.append(effect(number, runs, usual, read))
         print(json.dumps(lines[-1]), flush=True)
         if args.out is not None:
             with args.out.open("a", encoding="utf-8") as file:
@@ -174,9 +234,9 @@ def main() -> int:
     for line in (line for line in lines if size_of(line) > MOVES_NOTHING):
         name = ".".join(filter(None, line["number"]))
         print(f"{name}: {line['scale']:.2f}, {line['half_width']:.3f}, {line['place']:.2f}, {'; '.join(line['said'])}")
-    print(
-        "move nothing: " + ", ".join(".".join(filter(None, each["number"])) for each in lines if size_of(each) <= 0.01)
-    )
+    for what, is_read in (("read, and move nothing", True), ("not read", False)):
+        those = (line for line in lines if size_of(line) <= MOVES_NOTHING and bool(line["read_by"]) == is_read)
+        print(f"{what}: {', '.join('.'.join(filter(None, line['number'])) for line in those)}")
     return 0
 
 
