@@ -25,16 +25,16 @@ def seen_in(image: pycolmap.Image) -> tuple[Indices, Array]:
     return columns[:, 0].astype(np.int64), columns[:, 1:]
 
 
-def _ids_seen_in(image: pycolmap.Image) -> list[int]:
-    """Return the ids alone, in a tenth of the time."""
-    return [point.point3D_id for point in image.get_observation_points2D()]
+def ids_seen_in(image: pycolmap.Image) -> Indices:
+    """Return the ids alone, in half the time."""
+    return np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.int64)
 
 
 def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
     """Return the sparse matrix (n, n) of the numbers of points that pairs of the n registered photos both see."""
-    photos = [_ids_seen_in(model.image(image_id)) for image_id in model.reg_image_ids()]
+    photos = [ids_seen_in(model.image(image_id)) for image_id in model.reg_image_ids()]
     starts = np.cumsum([0, *map(len, photos)])
-    of_point = np.unique(np.concatenate(photos).astype(np.int64), return_inverse=True)[1]
+    of_point = np.unique(np.concatenate(photos), return_inverse=True)[1]
     sees = csr_array((np.ones(len(of_point)), of_point, starts), shape=(len(photos), int(of_point.max(initial=-1)) + 1))
     return csr_array(sees @ sees.T)
 
@@ -109,8 +109,8 @@ def _frames_see(model: pycolmap.Reconstruction, frame_ids: Indices) -> csr_array
     rows, points = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
-        ids = _ids_seen_in(image)
-        points.append(np.array(ids, dtype=np.int64))
+        ids = ids_seen_in(image)
+        points.append(ids)
         rows.append(np.full(len(ids), row_of[image.frame_id], dtype=np.int64))
     row, (unique, column) = np.concatenate(rows), np.unique(np.concatenate(points), return_inverse=True)
     return coo_array((np.ones(len(row)), (row, column)), shape=(len(frame_ids), len(unique))).tocsr()

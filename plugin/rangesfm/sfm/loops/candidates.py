@@ -11,7 +11,7 @@ import pycolmap
 from scipy.spatial import KDTree
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.colmap.pieces import seen_in
+from rangesfm.colmap.pieces import ids_seen_in
 from rangesfm.sfm.loops.relative_errors import RelativeErrors
 from rangesfm.util.geometry.rotations import cross_matrices
 
@@ -98,7 +98,7 @@ class Views:
 
 
 def _some_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array:
-    ids, _ = seen_in(image)
+    ids = ids_seen_in(image)
     chosen = ids[np.linspace(0, len(ids) - 1, _NUM_POINTS).round().astype(np.int64)]
     return np.array([model.point3D(point_id).xyz for point_id in chosen.tolist()])
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pycolmap
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.colmap.pieces import MIN_NUM_SHARED
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, ids_seen_in
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.sfm.loops.candidates import Views
 from rangesfm.sfm.loops.relative_errors import RelativeErrors
@@ -117,8 +119,17 @@ class Resection:
     def _seen(self, image_id: int, matches: Indices) -> Indices:
         """Return the (m,) ids of the points behind the first features of matches; -1 where there is none."""
         points = self.model.image(image_id).points2D
-        ids = [points[k].point3D_id if points[k].has_point3D() else -1 for k in matches[:, 0].tolist()]
-        return np.array(ids, dtype=np.int64)
+        ids = np.array([points[k].point3D_id for k in matches[:, 0].tolist()], dtype=np.uint64)
+        return ids.astype(np.int64)  # COLMAP's id of no point is the largest one, 2^64 - 1
+
+    @cached_property
+    def _sightings(self) -> tuple[Indices, Indices, Indices]:
+        """Return the ids (p,) of the points, ascending, the first sighting (p + 1,) of each, and the view of each."""
+        seen = [ids_seen_in(self.model.image(image_id)) for image_id in self.views.image_ids.tolist()]
+        ids, view = np.concatenate(seen), np.repeat(np.arange(len(seen)), list(map(len, seen)))
+        order = np.argsort(ids, kind="stable")
+        known, first = np.unique(ids[order], return_index=True)
+        return known, np.append(first, len(ids)), view[order]
 
     def _frame_of(self, image_id: int) -> int:
         return int(self.views.frame[self.views.row_of[image_id]])
@@ -137,26 +148,28 @@ class Resection:
         Returns:
             As the attributes ``frames``, ``by_frame`` and ``noise`` of a loop, all of first order.
         """
-        views, tracks = self.views, [self.model.point3D(id_).track.elements for id_ in ids.tolist()]
-        point = np.repeat(np.arange(len(ids)), [len(track) for track in tracks])
-        row = np.array([views.row_of[element.image_id] for track in tracks for element in track])
+        views, (known, first, view) = self.views, self._sightings
+        place = np.searchsorted(known, ids)
+        num = first[place + 1] - first[place]
+        starts = np.cumsum(num) - num
+        point = np.repeat(np.arange(len(ids)), num)
+        row = view[np.arange(num.sum()) + np.repeat(first[place] - starts, num)]
         seen = _pixels_by_points(points[point] - views.centers[row], views.world_from_cam[row], views.focal_px[row])
-        information = np.zeros((len(ids), 3, 3))
-        np.add.at(information, point, np.swapaxes(seen, 1, 2) @ seen)
+        information = np.add.reduceat(np.swapaxes(seen, 1, 2) @ seen, starts)
         inverse = np.linalg.pinv(information, hermitian=True)
         noise = self.pixel_stddev**2 * (np.eye(2) + by_point @ inverse @ np.swapaxes(by_point, 1, 2))
         by_pose = _pixels_by_pose(by_point, points - center)
-        weighted = np.swapaxes(by_pose, 1, 2) @ np.linalg.inv(noise)
+        weights = np.linalg.inv(noise)
+        weighted = np.swapaxes(by_pose, 1, 2) @ weights
         covariance = np.linalg.inv(np.sum(weighted @ by_pose, axis=0))
-        squared = np.einsum("ki,kij,kj", residuals_px, np.linalg.inv(noise), residuals_px)
+        squared = np.einsum("ki,kij,kj", residuals_px, weights, residuals_px)
         variance = max(float(squared) / (residuals_px.size - len(covariance)), 1.0)
-        to_pose = -covariance @ weighted @ by_point
         frame = views.frame[row]
-        to_points = inverse[point] @ np.swapaxes(seen, 1, 2)
-        by_seen = to_points @ _pixels_by_pose(seen, points[point] - self.errors.centers[frame])
-        frames, place = np.unique(frame, return_inverse=True)
-        by_frame = np.zeros((len(frames), 6, 6))
-        np.add.at(by_frame, place, -to_pose[point] @ by_seen)
+        to_pose = (covariance @ weighted @ by_point @ inverse)[point] @ np.swapaxes(seen, 1, 2)
+        by_seen = to_pose @ _pixels_by_pose(seen, points[point] - self.errors.centers[frame])
+        frames, of_frame = np.unique(frame, return_inverse=True)
+        adder = csr_array((np.ones(len(row)), (of_frame, np.arange(len(row)))), shape=(len(frames), len(row)))
+        by_frame = (adder @ by_seen.reshape(-1, 36)).reshape(-1, 6, 6)
         return frames, by_frame, variance * covariance
 
 
