@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.ranges.clock.offset import CostCurve, Rival, TimeOffset
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.pipeline.clock_rivals import scale_by_rivals
 from rangesfm.util.geometry.similarity import Similarity
 
@@ -25,7 +25,7 @@ class Scales:
     frame: str = "first_camera"
 
     def by_rivals(self, probability: float, rival_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Any:
-        offset = time_offset(probability, (Rival(RIVAL_S, 1 - probability),))
+        offset = time_offset(probability).beside([(RIVAL_S, 1 - probability)])
         path: Any = SimpleNamespace(centers=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 
         def estimate_at(other: TimeOffset) -> Any:
@@ -44,9 +44,8 @@ def estimate(scale: float, at_m: tuple[float, float, float], frame: str) -> Any:
     return SimpleNamespace(value=scale, frame=frame, metric_from_sfm=placed)
 
 
-def time_offset(probability: float, rivals: tuple[Rival, ...]) -> TimeOffset:
-    curve = CostCurve(np.zeros(0), np.zeros(0))
-    return TimeOffset(VALUE_S, 0.01, curve, True, 1e-3, 1e-5, True, 0.0, None, probability, rivals)
+def time_offset(probability: float) -> TimeOffset:
+    return TimeOffset(VALUE_S, 0.01, drift=1e-3, drift_stddev=1e-5, drift_is_followed=True, probability=probability)
 
 
 def test_a_rival_of_nearly_the_same_scale_is_told_with_its_probability_and_its_scale() -> None:

@@ -77,7 +77,7 @@ def scale_by_rivals(
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
         try:
-            other = estimate_at(offset.of_rival(rival))
+            other = estimate_at(rival)
         except GeometryError:
             doubts.append(f"the time offset{whose} may also be {said}, which gives no scale")
             continue

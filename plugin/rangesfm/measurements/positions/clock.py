@@ -5,8 +5,7 @@ The rule by which offsets are found, compared and doubted is that of ranges (``r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,8 @@ import numpy as np
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
-from rangesfm.measurements.ranges.clock.fit import OffsetFit, Timing, refine_offset
+from rangesfm.measurements.ranges.clock.fit import OffsetFit, refine_offset
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.search import (
     Cells,
     OffsetCurve,
@@ -23,7 +23,7 @@ from rangesfm.measurements.ranges.clock.search import (
     centred_columns,
     scan_parts,
 )
-from rangesfm.measurements.ranges.clock.squares import residual_stddev
+from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stddev
 from rangesfm.measurements.ranges.clock.time_offset import (
     ObservedKind,
     offset_of_motion,
@@ -34,7 +34,7 @@ from rangesfm.progress import SILENT
 from rangesfm.util.files.photo_names import rows_of_photos, told_none
 from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import CAUCHY
-from rangesfm.util.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
+from rangesfm.util.geometry.similarity import align_points, rounding_of, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 # A given offset is wrong if the residuals with it are at least so many times those with another one.
@@ -52,54 +52,8 @@ class TimedPositions(NamedTuple):
         return TimedPositions(self.times_s[rows], self.position_m[rows])
 
 
-@dataclass(frozen=True)
-class SimilarityFit:
-    """Robust fit of a similarity from points on a path to n positions.
-
-    Attributes:
-        site_from_model: the similarity.
-        predicted_m, residuals_m: (n, 3) fitted positions, and measured minus fitted.
-        weights_of_positions: (n,) in [0, 1].
-    """
-
-    site_from_model: Similarity
-    predicted_m: Array
-    residuals_m: Array
-    weights_of_positions: Array
-    num_unknowns: int = 7
-
-    @property
-    def scale(self) -> float:
-        """Metres per model unit."""
-        return self.site_from_model.scale
-
-    @property
-    def weights(self) -> Array:
-        """Weights of the coordinates (3 n,)."""
-        return np.repeat(self.weights_of_positions, 3)
-
-    @property
-    def weighted_residuals(self) -> Array:
-        """Residuals times the roots of their weights (3 n,), metres."""
-        return np.asarray(np.sqrt(self.weights) * self.residuals_m.ravel())
-
-    @cached_property
-    def basis(self) -> Array:
-        """Orthonormal weighted columns (3 n, p) of the similarity; p is smaller if the path leaves a turn open."""
-        motions = similarity_motions(self.predicted_m - self.predicted_m.mean(axis=0)).reshape(-1, self.num_unknowns)
-        columns = np.sqrt(self.weights)[:, None] * motions
-        lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
-        return np.asarray(basis[:, strengths > UNDETERMINED * strengths[0]])
-
-    def unexplained(self, values: Array) -> Array:
-        """Return weighted changes of the coordinates (3 n, k) without the parts that a similarity can explain."""
-        weighted = np.sqrt(self.weights)[:, None] * values
-        return np.asarray(weighted - self.basis @ (self.basis.T @ weighted))
-
-
-def fit_similarity(points: Array, position_m: Array) -> SimilarityFit:
-    """Fit a similarity from (n, 3) points to (n, 3) positions by iteratively reweighted least squares."""
+def fit_similarity(points: Array, position_m: Array) -> RobustFit:
+    """Fit a similarity from (n, 3) points to the coordinates of (n, 3) positions by reweighted least squares."""
     weights = _weights_by_place(position_m)
     for _ in range(NUM_REWEIGHTINGS + 1):
         found = align_points(points, position_m, weights=weights)
@@ -107,7 +61,14 @@ def fit_similarity(points: Array, position_m: Array) -> SimilarityFit:
         residuals_m = position_m - predicted_m
         away = np.sqrt(np.mean(residuals_m**2, axis=1)) / residual_stddev(residuals_m.ravel())
         weights = CAUCHY.weights(away)
-    return SimilarityFit(found, predicted_m, residuals_m, weights)
+    of_coordinates = np.repeat(weights, 3)
+    motions = similarity_motions(predicted_m - predicted_m.mean(axis=0)).reshape(-1, 7)
+    columns = np.sqrt(of_coordinates)[:, None] * motions
+    lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
+    is_shown = strengths > UNDETERMINED * strengths[0]  # a straight path leaves a turn open
+    gradient = np.tile(found.scale * found.rotation, (len(points), 1))
+    return RobustFit(of_coordinates, residuals_m.ravel(), gradient, found.scale, 7, basis[:, is_shown])
 
 
 def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
@@ -119,13 +80,8 @@ def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float,
     positions = positions.take(path.knows(positions.times_s + offset_s))
     num = len(positions.times_s)
     points, velocities = path.tag(positions.times_s + offset_s, np.zeros(num, dtype=np.int64), scale)
-    solved = fit_similarity(points, positions.position_m)
-    rates = solved.scale * velocities @ solved.site_from_model.rotation.T
-    axes = np.tile(np.arange(3), num)
-    measured_m = positions.position_m.ravel()
-    return OffsetFit.from_solution(
-        offset_s, positions, measured_m, axes, solved, solved.residuals_m.ravel(), rates.ravel()
-    )
+    solved, axes = fit_similarity(points, positions.position_m), np.tile(np.arange(3), num)
+    return OffsetFit.from_solution(offset_s, positions, positions.position_m.ravel(), axes, solved, velocities)
 
 
 def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
@@ -162,9 +118,9 @@ def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scann
     cells = Cells.from_times(positions.times_s, path)
     correlate = cells.correlate
     squared, *centers, known = centred_columns(path, cells.stride).T
-    of_path = [correlate.transform(values) for values in (known, *centers, squared)]
+    of_path = [cells.of_path(values) for values in (known, *centers, squared)]
     position_m = positions.position_m - np.median(positions.position_m, axis=0)
-    of_log = [cells.transform(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
+    of_log = [cells.of_log(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
     square_m2 = np.sum(position_m**2, axis=1)
     num = correlate(of_path[0], of_log[0])
     total = np.maximum(num, 1e-12 * weights.sum())
@@ -173,17 +129,17 @@ def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scann
     products = np.array([[correlate(own, values) for own in of_path[1:4]] for values in of_log[1:]]) / total
     cross = np.moveaxis(products, 2, 0) - mean_m[:, :, None] * mean_of_path[:, None, :]
     of_places = np.maximum(correlate(of_path[4], of_log[0]) / total - np.sum(mean_of_path**2, axis=1), 0.0)
-    variation = correlate(of_path[0], cells.transform(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
+    variation = correlate(of_path[0], cells.of_log(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
     strengths = np.linalg.svd(cross, compute_uv=False)
     strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
     explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
     return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
 
 
-def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
     """Refine an offset; a drift of the clocks is not looked for."""
     fit = refine_offset(positions, path, offset_s, fit_at=fit_positions)
-    return fit, fit.timing(), 0.0, float(positions.times_s.mean())
+    return fit, replace(fit.timed(), reference_s=float(positions.times_s.mean()))
 
 
 POSITIONS = ObservedKind(

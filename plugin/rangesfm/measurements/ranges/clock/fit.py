@@ -7,16 +7,17 @@ same way.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.search import MIN_COVERAGE, AnyObserved, Observed, PathSamples, TimedRanges
-from rangesfm.measurements.ranges.clock.squares import fit_squares, residual_stddev
+from rangesfm.measurements.ranges.clock.squares import RobustFit, fit_squares, residual_stddev
 from rangesfm.measurements.ranges.errors.noise import STRETCH_S
 from rangesfm.util.geometry.numerics import (
     MAX_NUM_ROUNDS,
@@ -40,45 +41,6 @@ _MIN_NUM_BLOCKS = 12
 # as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
 # distribution with a dozen blocks.
 _MIN_GAIN_STDDEVS = 7.0
-
-
-class Timing(NamedTuple):
-    """Uncertainty of the time offset, and the drift of the clocks.
-
-    Attributes:
-        stddev_s: standard deviation of the offset; infinite if the motion does not determine it.
-        drift: gain of the camera's clock on the radio's, seconds per second.
-        drift_stddev: standard deviation of the drift.
-    """
-
-    stddev_s: float
-    drift: float
-    drift_stddev: float
-
-
-class RobustFit(Protocol):
-    """Robust fit of n numbers by linear unknowns.
-
-    Attributes:
-        weights: (n,) in [0, 1]. scale: metres per model unit; infinite if it is not determined.
-        num_unknowns: their number. weighted_residuals: (n,) measured minus fitted, times the roots of the weights.
-        basis: (n, p) orthonormal weighted columns of all unknowns.
-    """
-
-    @property
-    def weights(self) -> Array: ...
-    @property
-    def scale(self) -> float: ...
-    @property
-    def num_unknowns(self) -> int: ...
-    @property
-    def weighted_residuals(self) -> Array: ...
-    @property
-    def basis(self) -> Array: ...
-
-    def unexplained(self, values: Array) -> Array:
-        """Return weighted changes of the numbers (n, k) without the parts that the unknowns can explain."""
-        ...
 
 
 FitAt = Callable[[AnyObserved, PathSamples, float, float], "OffsetFit"]
@@ -115,23 +77,24 @@ class OffsetFit:
         measured_m: Array,
         alike: Indices,
         solved: RobustFit,
-        residuals_m: Array,
-        rates: Array,
+        velocities: Array,
     ) -> OffsetFit:
         """Make a fit from its solution.
 
         Args:
             measured_m: (n,) observed numbers. alike: (n,) index of the series that each belongs to, such as its anchor.
-            residuals_m: (n,) measured minus fitted.
+            velocities: (m, 3) of the points on the path at the m observations, model units per second.
         """
         deviations = measured_m.copy()
         for rows in rows_by_key(alike):
             deviations[rows] -= np.median(deviations[rows])
-        times_s = np.repeat(observed.times_s, len(measured_m) // max(len(observed.times_s), 1))
+        num_each = len(measured_m) // max(len(observed.times_s), 1)
+        times_s = np.repeat(observed.times_s, num_each)
         cells = np.floor(times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
         num_cells = len(np.unique(cells))
         num_spare = num_cells - solved.num_unknowns - 1
-        residuals = residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
+        residuals = solved.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
+        rates = np.einsum("ni,ni->n", solved.gradient, np.repeat(velocities, num_each, axis=0))
         return cls(offset_s, observed, solved, residuals, num_spare, deviations, rates)
 
     @property
@@ -195,17 +158,21 @@ class OffsetFit:
         behind = rival.score - self.score
         return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
 
-    def timing(self) -> Timing:
-        """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
+    def timed(self) -> TimeOffset:
+        """Return the offset and the drift, with standard deviations that account for errors alike in blocks of time.
+
+        That of the offset is infinite if the motion does not determine it.
+        """
         times = self.times_s - self.times_s.mean()
         own = self.solved.unexplained(np.stack([self.rates, self.rates * times], axis=1))
         if not _is_determined(own[:, 0], self.rates):
-            return Timing(np.inf, 0.0, np.inf)
+            return TimeOffset(self.offset_s, np.inf)
         residuals = self.solved.weighted_residuals
         change = np.linalg.lstsq(own, residuals, rcond=None)[0]
         alone = self._variances(own[:, :1], residuals, times)
         both = self._variances(own, residuals - own @ change, times)
-        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])))
+        drift_stddev = float(np.sqrt(both[1]))
+        return TimeOffset(self.offset_s, float(np.sqrt(alone[0])), drift=float(change[1]), drift_stddev=drift_stddev)
 
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
         """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
@@ -226,9 +193,8 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
     """
     ranges = ranges.take(path.knows(ranges.times_s + offset_s))
     points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
-    squares = fit_squares(points, ranges.range_m, ranges.anchor)
-    rates = np.einsum("ni,ni->n", squares.gradient, velocities)
-    return OffsetFit.from_solution(offset_s, ranges, ranges.range_m, ranges.anchor, squares, squares.residuals_m, rates)
+    solved = fit_squares(points, ranges.range_m, ranges.anchor)
+    return OffsetFit.from_solution(offset_s, ranges, ranges.range_m, ranges.anchor, solved, velocities)
 
 
 def refine_offset(
@@ -323,29 +289,29 @@ def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks
     return [variances(block) for block in blocks]
 
 
-def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
     """Refine an offset, and if the ranges show a significant drift, offset and drift together.
 
     Returns:
-        The fit, with the drift removed from the times of its ranges. The uncertainty of the offset, with the drift that
-        is left. The drift, in seconds per second, or 0 if it is not significant. The radio's time at which the offset
-        is valid.
+        The fit, with the drift removed from the times of its ranges, and the offset, which follows a significant drift.
     """
     reference_s = float(ranges.times_s.mean())
     fit = refine_offset(ranges, path, offset_s)
-    timing, followed, least_stddevs = fit.timing(), 0.0, SIGNIFICANT_STDDEVS
+    found, followed, least_stddevs = fit.timed(), 0.0, SIGNIFICANT_STDDEVS
     for _ in range(MAX_NUM_ROUNDS):
-        if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
+        if not abs(found.drift) > least_stddevs * found.drift_stddev:
             break
-        followed, least_stddevs = followed + timing.drift, NEGLIGIBLE_STDDEVS
+        followed, least_stddevs = followed + found.drift, NEGLIGIBLE_STDDEVS
         # The times become those of a radio clock that runs at the rate of the camera's.
         times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
         fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
-        timing = fit.timing()
-    return fit, timing, followed, reference_s
+        found = fit.timed()
+    note = _drift_note(followed, found.drift_stddev, ranges.times_s) if followed else None
+    drift, is_followed = followed or found.drift, followed != 0
+    return fit, replace(found, drift=drift, drift_is_followed=is_followed, reference_s=reference_s, note=note)
 
 
-def drift_note(drift: float, stddev: float, times_s: Array) -> str:
+def _drift_note(drift: float, stddev: float, times_s: Array) -> str:
     """Return a message for the user about a drift that was found."""
     half_span_s = float(np.ptp(times_s)) / 2
     return (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,13 +24,6 @@ class CostCurve:
     costs_m: Array
 
 
-class Rival(NamedTuple):
-    """Another time offset that may be the right one: image time = range time + ``value_s``."""
-
-    value_s: float
-    probability: float
-
-
 @dataclass(frozen=True)
 class TimeOffset:
     """Offset of the clocks: image time = range time + ``value_s``.
@@ -46,13 +39,13 @@ class TimeOffset:
         reference_s: radio's time at which the clocks differ by ``value_s``.
         note: message for the user, or None.
         probability: probability that the value is the right offset, and none of the rivals is.
-        rivals: other offsets that cannot be ruled out, the most likely first.
+        rivals: other offsets that cannot be ruled out, the most likely first; no drift is followed with them.
         is_certain: whether the error of a range due to ``stddev_s`` is smaller than its noise.
     """
 
     value_s: float
     stddev_s: float
-    curve: CostCurve
+    curve: CostCurve = CostCurve(np.zeros(0), np.zeros(0))
     offset_matters: bool = True
     drift: float = 0.0
     drift_stddev: float = np.inf
@@ -60,22 +53,27 @@ class TimeOffset:
     reference_s: float = 0.0
     note: str | None = None
     probability: float = 1.0
-    rivals: tuple[Rival, ...] = ()
+    rivals: tuple[TimeOffset, ...] = ()
     is_certain: bool = True
 
     @classmethod
     def given(cls, value_s: float) -> TimeOffset:
         """Return an offset that was not searched for."""
-        return cls(value_s, 0.0, CostCurve(np.zeros(0), np.zeros(0)))
+        return cls(value_s, 0.0)
 
     @property
     def is_given(self) -> bool:
         """Whether it was not searched for."""
         return not len(self.curve.offsets_s)
 
-    def of_rival(self, rival: Rival) -> TimeOffset:
-        """Return the offset with a rival's value; the drift was estimated for the present value and is not followed."""
-        return replace(self, value_s=rival.value_s, drift_is_followed=False, probability=rival.probability, rivals=())
+    def beside(self, rivals: Iterable[tuple[float, float]]) -> TimeOffset:
+        """Return the offset with others that may be the right one; the drift was estimated for the present value.
+
+        Args:
+            rivals: values in seconds, and their probabilities.
+        """
+        others = (replace(self, value_s=at, drift_is_followed=False, probability=chance) for at, chance in rivals)
+        return replace(self, rivals=tuple(others))
 
     def at(self, radio_times_s: Array) -> Array:
         """Return the offsets (n,) at times (n,) of the radio's clock."""

@@ -8,7 +8,7 @@ pass.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -229,17 +229,20 @@ class Scanned(NamedTuple):
     residual: Array
 
 
-class Cells(NamedTuple):
-    """The times of n observations as cells of a grid that samples of the path share, to correlate them.
+@dataclass(frozen=True)
+class Cells:
+    """The times of n observations as cells of a grid that samples of the path share, to correlate both in time.
 
     Attributes:
-        cell: (n,) index of each observation's cell. stride: every so many samples are on the grid.
-        correlate: correlations of samples with cells. offsets_s: (m,) of these.
+        cell: (n,) index of each observation's cell. num_cells: their number.
+        stride: every so many samples of the path are on the grid. num_samples: number of these.
+        offsets_s: (m,) all offsets at which samples and cells overlap, ascending.
     """
 
     cell: Indices
+    num_cells: int
     stride: int
-    correlate: Correlation
+    num_samples: int
     offsets_s: Array
 
     @classmethod
@@ -248,16 +251,29 @@ class Cells(NamedTuple):
         first_s, last_s = float(times_s.min()), float(times_s.max())
         span_s = len(path) * path.step_s + last_s - first_s
         stride = max(1, round(span_s / (_MAX_NUM_STEPS * path.step_s)))
-        step_s, num = stride * path.step_s, len(range(0, len(path), stride))
+        step_s, num_samples = stride * path.step_s, len(range(0, len(path), stride))
         cell = np.rint((times_s - first_s) / step_s).astype(np.int64)
-        correlate = Correlation(num, int(cell.max()) + 1)
-        offsets = path.start_s - first_s + step_s * np.arange(1.0 - correlate.num_cells, num)
-        return cls(cell, stride, correlate, offsets)
+        num_cells = int(cell.max()) + 1
+        offsets = path.start_s - first_s + step_s * np.arange(1.0 - num_cells, num_samples)
+        return cls(cell, num_cells, stride, num_samples, offsets)
 
-    def transform(self, values: Array) -> npt.NDArray[np.complex128]:
+    @property
+    def _size(self) -> int:
+        return int(next_fast_len(len(self.offsets_s), real=True))
+
+    def of_path(self, values: Array) -> npt.NDArray[np.complex128]:
+        """Return the transform of values (num_samples,) along the path."""
+        return np.asarray(rfft(values, self._size))
+
+    def of_log(self, values: Array) -> npt.NDArray[np.complex128]:
         """Return the transform of the sums of (n,) values in the cells."""
-        sums = np.bincount(self.cell, values, minlength=self.correlate.num_cells)
-        return self.correlate.transform(sums.astype(np.float64))
+        return self.of_path(np.bincount(self.cell, values, minlength=self.num_cells).astype(np.float64))
+
+    def correlate(self, path: npt.NDArray[np.complex128], log: npt.NDArray[np.complex128]) -> Array:
+        """Return the correlation (m,) at all offsets from both transforms."""
+        around = irfft(path * np.conj(log), self._size)
+        # At the first offset, the last cell is on the first sample.
+        return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
 
 
 def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
@@ -265,11 +281,11 @@ def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
     cells = Cells.from_times(ranges.times_s, path)
     columns = centred_columns(path, cells.stride)
     pairs = combinations_with_replacement(range(columns.shape[1]), 2)
-    products = {(i, j): cells.correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}
+    products = {(i, j): cells.of_path(columns[:, i] * columns[:, j]) for i, j in pairs}
 
-    sums = np.zeros((5, cells.correlate.num_offsets))
+    sums = np.zeros((5, len(cells.offsets_s)))
     for rows in rows_by_key(ranges.anchor):
-        of_anchor = cells._replace(cell=cells.cell[rows])
+        of_anchor = replace(cells, cell=cells.cell[rows])
         sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], of_anchor, products)
     num, variation, without, column, cross = sums
     scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)
@@ -292,26 +308,6 @@ def centred_columns(path: PathSamples, stride: int) -> Array:
     return np.column_stack([np.sum(centers**2, axis=1, keepdims=True), centers, known])
 
 
-class Correlation:
-    """Correlations in time of cells of the log with samples of the path, at every shift at which they overlap."""
-
-    def __init__(self, num_samples: int, num_cells: int):
-        self.num_samples, self.num_cells = num_samples, num_cells
-        self.num_offsets = num_samples + num_cells - 1
-        self._size = next_fast_len(self.num_offsets, real=True)
-
-    def transform(self, values: Array) -> npt.NDArray[np.complex128]:
-        return np.asarray(rfft(values, self._size))
-
-    def __call__(self, samples: npt.NDArray[np.complex128], cells: npt.NDArray[np.complex128]) -> Array:
-        """Return the correlation (num_offsets,) from both transforms.
-
-        At the first offset, the last cell is on the first sample.
-        """
-        around = irfft(samples * np.conj(cells), self._size)
-        return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
-
-
 def _sums_of_anchor(
     range_m: Array,
     weights: Array,
@@ -328,14 +324,14 @@ def _sums_of_anchor(
     weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
 
     correlate = cells.correlate
-    own_weights, weighted = cells.transform(weight), cells.transform(weight * squared)
+    own_weights, weighted = cells.of_log(weight), cells.of_log(weight * squared)
     ones = max(products)[0]  # the last of the columns, from 0
-    normal = np.empty((correlate.num_offsets, ones + 1, ones + 1))
+    normal = np.empty((len(cells.offsets_s), ones + 1, ones + 1))
     for (i, j), product in products.items():
         normal[:, i, j] = normal[:, j, i] = correlate(product, own_weights)
     right = np.stack([correlate(products[i, ones], weighted) for i in range(ones + 1)], axis=1)
-    total = correlate(products[ones, ones], cells.transform(weight * squared**2))
-    num = correlate(products[ones, ones], cells.transform(weights))
+    total = correlate(products[ones, ones], cells.of_log(weight * squared**2))
+    num = correlate(products[ones, ones], cells.of_log(weights))
 
     # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
     own = normal[:, 1:, 1:] + (1e-6 * normal[:, ones, ones] + 1e-9 * weight.sum())[:, None, None] * np.eye(ones)

@@ -8,7 +8,6 @@ there is one solution and no start is needed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -25,48 +24,40 @@ _MIN_CURVATURE_STDDEVS = 5.0
 
 
 @dataclass(frozen=True)
-class SquaresFit:
-    """Robust fit of ``rho^2 = alpha^2 |p|^2 + b.p + k``, with b and k for each anchor and one alpha for all.
+class RobustFit:
+    """Robust fit of n numbers by linear unknowns, of which one is the scale of a path.
 
     Attributes:
         weights: (n,) weights of the Cauchy loss, in [0, 1].
-        residuals_m: (n,) measured minus fitted ranges.
-        gradient: (n, 3) derivative of the fitted range by each point, metres per model unit.
-        scale: alpha, metres per model unit; infinite if the path is too small to determine it.
+        residuals_m: (n,) measured minus fitted.
+        gradient: (n, 3) derivative of each fitted number by its point on the path, metres per model unit.
+        scale: metres per model unit; infinite if the path is too small to determine it.
+        num_unknowns: their number.
+        basis: (n, p) orthonormal weighted columns of all unknowns.
     """
 
     weights: Array
     residuals_m: Array
     gradient: Array
     scale: float
-    _columns: _LinearColumns
-
-    @property
-    def num_unknowns(self) -> int:
-        """Number of unknowns: four for each anchor, and the scale."""
-        return 4 * self._columns.num_anchors + 1
+    num_unknowns: int
+    basis: Array
 
     @property
     def weighted_residuals(self) -> Array:
         """Residuals times the roots of their weights (n,), metres."""
         return np.asarray(np.sqrt(self.weights) * self.residuals_m)
 
-    @cached_property
-    def basis(self) -> Array:
-        """Orthonormal weighted columns (n, p) of all unknowns of the fit."""
-        curvature = self._columns.curvature
-        norm = max(float(np.linalg.norm(curvature)), 1e-300)
-        return np.column_stack([self._columns.anchors_basis(), curvature / norm])
-
     def unexplained(self, values: Array) -> Array:
-        """Return weighted changes of the ranges (n, k) without the parts that anchors and scale can explain."""
-        left = self._columns.without_anchors(np.sqrt(self.weights)[:, None] * values)
-        curvature = self._columns.curvature
-        return np.asarray(left - np.outer(curvature, curvature @ left) / max(float(curvature @ curvature), 1e-300))
+        """Return weighted changes of the numbers (n, k) without the parts that the unknowns can explain."""
+        weighted = np.sqrt(self.weights)[:, None] * values
+        return np.asarray(weighted - self.basis @ (self.basis.T @ weighted))
 
 
-def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = CAUCHY.width) -> SquaresFit:
-    """Fit ranges by iteratively reweighted least squares, starting from equal weights.
+def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = CAUCHY.width) -> RobustFit:
+    """Fit ``rho^2 = alpha^2 |p|^2 + b.p + k``, with b and k for each anchor and one scale alpha for all.
+
+    It is solved by iteratively reweighted least squares, starting from equal weights.
 
     Args:
         points: (n, 3) positions of the antenna, model units.
@@ -89,21 +80,19 @@ def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: floa
     is_curved = alpha_squared * np.linalg.norm(columns.curvature) > _MIN_CURVATURE_STDDEVS * np.std(residuals)
     gradient = metres[:, None] * (2 * alpha_squared * points + coefficients) / unit
     scale = float(np.sqrt(alpha_squared)) / unit if is_curved else np.inf
-    return SquaresFit(weights, residuals_m, gradient, scale, columns)
+    return RobustFit(weights, residuals_m, gradient, scale, 4 * len(groups) + 1, columns.basis())
 
 
 class _LinearColumns:
     """Weighted columns of the linear model, with those of each anchor made orthonormal.
 
     Attributes:
-        num_anchors: number of anchors with ranges.
         curvature: (n,) part of the column |p|^2 that the anchors' own unknowns do not explain.
     """
 
     def __init__(self, design: Array, row_weights: Array, groups: list[Indices]):
         self._row_weights = row_weights
         self._squared_norm = np.sum(design[:, :3] ** 2, axis=1)
-        self.num_anchors = len(groups)
         self._factors = []
         weighted = row_weights[:, None] * design
         of_groups = [weighted[rows] for rows in groups]
@@ -122,13 +111,13 @@ class _LinearColumns:
             left_over[rows] -= basis @ (basis.T @ values[rows])
         return left_over
 
-    def anchors_basis(self) -> Array:
-        """Return the anchors' own columns (n, up to 4 num_anchors); each is zero for ranges to other anchors."""
+    def basis(self) -> Array:
+        """Return the orthonormal columns of all unknowns; those of an anchor are zero for the ranges of others."""
         padded = []
         for rows, basis, _ in self._factors:
             padded.append(np.zeros((len(self._row_weights), basis.shape[1])))
             padded[-1][rows] = basis
-        return np.column_stack(padded)
+        return np.column_stack([*padded, self.curvature / max(float(np.linalg.norm(self.curvature)), 1e-300)])
 
     def solve(self, squared_ranges: Array) -> tuple[float, Array, Array]:
         """Return alpha^2 (not negative), the vector b of each range's anchor (n, 3), and weighted residuals (n,)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,13 +17,11 @@ from rangesfm.measurements.ranges.clock.fit import (
     SEPARATION_S,
     FitAt,
     OffsetFit,
-    Timing,
-    drift_note,
     fit_at_offset,
     fit_clocks,
     refine_offset,
 )
-from rangesfm.measurements.ranges.clock.offset import Rival, TimeOffset
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.search import (
     Observed,
     OffsetCurve,
@@ -117,15 +116,14 @@ class ObservedKind(NamedTuple):
     Attributes:
         name: in words. remedy: what the user can do where the motion does not determine the offset.
         scan: computes cost and score of all offsets, given weights or None. fit_at: fits one offset.
-        fit_clocks: refines an offset with all that was observed, and returns the fit, its timing, a drift that it found
-            and the time at which the offset is valid.
+        fit_clocks: refines an offset with all that was observed, and returns the fit and what it says of the clocks.
     """
 
     name: str
     remedy: str
     scan: Callable[[Any, PathSamples, Array | None], OffsetCurve]
     fit_at: FitAt[Any]
-    fit_clocks: Callable[[Any, PathSamples, float], tuple[OffsetFit, Timing, float, float]]
+    fit_clocks: Callable[[Any, PathSamples, float], tuple[OffsetFit, TimeOffset]]
 
 
 _RANGES = ObservedKind("ranges", REMEDY, scan_offsets, fit_at_offset, fit_clocks)
@@ -189,27 +187,20 @@ def offset_of_motion(
             f"too far apart, or the log belongs to other photos): {remedy}"
         )
     near = on_path(mixed, path, best.offset_s, _NUM_OF_FINAL)
-    final, timing, drift, reference_s = kind.fit_clocks(near, path, best.offset_s)
-    is_certain = bool(timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
-    found = f"(about {final.offset_s:+.2f} s, within {NORMAL_95 * timing.stddev_s:.2g} s, 95 %)"
-    if not is_certain and not timing.stddev_s < _MOST_UNCERTAIN_S:
-        raise GeometryError(f"the motion is too even to tell the time offset {found}: {remedy}")
-    notes = [drift_note(drift, timing.drift_stddev, near.times_s)] if drift else []
-    if not is_certain:
-        notes.append(f"the motion is too even to tell the time offset well {found}: {remedy} if you know it better")
-    return TimeOffset(
-        value_s=final.offset_s,
-        stddev_s=timing.stddev_s,
+    final, found = kind.fit_clocks(near, path, best.offset_s)
+    is_certain = bool(found.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
+    said = f"(about {final.offset_s:+.2f} s, within {NORMAL_95 * found.stddev_s:.2g} s, 95 %)"
+    if not is_certain and not found.stddev_s < _MOST_UNCERTAIN_S:
+        raise GeometryError(f"the motion is too even to tell the time offset {said}: {remedy}")
+    uneven = f"the motion is too even to tell the time offset well {said}: {remedy} if you know it better"
+    found = replace(
+        found,
         curve=kind.scan(final.observed, path, final.weights).around(final.offset_s),
-        drift=drift or timing.drift,
-        drift_stddev=timing.drift_stddev,
-        drift_is_followed=drift != 0,
-        reference_s=reference_s,
-        note="; ".join(notes) or None,
+        note="; ".join(filter(None, (found.note, None if is_certain else uneven))) or None,
         probability=probability,
-        rivals=tuple(Rival(fit.offset_s, probability) for fit, probability in rivals),
         is_certain=is_certain,
     )
+    return found.beside((fit.offset_s, probability) for fit, probability in rivals)
 
 
 def _offset_of_bursts(
@@ -232,7 +223,7 @@ def _offset_of_bursts(
     num_staying = _num_at_same_photo(log, trajectory, association, value_s, earliest_s, latest_s)
     if num_staying < _MIN_SAME_SHARE * num_in_bursts:
         return None
-    return TimeOffset(
+    found = TimeOffset(
         value_s=value_s,
         stddev_s=(latest_s - earliest_s) / np.sqrt(12),
         curve=curve_of(pairings, bursts, trajectory),
@@ -241,8 +232,8 @@ def _offset_of_bursts(
         note=f"the camera stands still at every photo: any time offset from {earliest_s:+.2f} s to {latest_s:+.2f} s "
         f"gives the same result; {value_s:+.2f} s centres the ranges on the photos",
         probability=likely[0][1],
-        rivals=tuple(Rival(pairings[number].offset_s, probability) for number, probability in likely[1:]),
     )
+    return found.beside((pairings[number].offset_s, probability) for number, probability in likely[1:])
 
 
 def _num_at_same_photo(log: RangeLog, trajectory: Trajectory, association: RangesOptions, *offsets_s: float) -> int:
@@ -287,7 +278,7 @@ def _likely_fits(
     num_on_path = np.array([np.count_nonzero(path.knows(times_s + fit.offset_s)) for fit in fits])
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
     best, most = fits[order[0]], num_on_path[order[0]]
-    same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timing().stddev_s, 1.0))
+    same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timed().stddev_s, 1.0))
     log_s, path_s = float(np.ptp(times_s)), path.step_s * (len(path) - 1)
     difference = max(1.0 - min(log_s, path_s) / max(log_s, path_s), _LEAST_DIFFERENCE)
     # Two durations of which nothing is known differ by less than a small share with twice that probability.
