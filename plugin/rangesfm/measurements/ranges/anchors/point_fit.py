@@ -267,16 +267,20 @@ def _directions() -> Array:
 
 
 @dataclass(frozen=True)
-class FitErrors:
-    """Errors of the n ranges of one anchor.
+class JudgedFit:
+    """A fit with the covariance of the errors of its n ranges.
 
     Attributes:
+        fit: the fit.
         of_bin: (n,) index of each range's bin.
         covariance_m2: (c, c) covariance of the errors of all bins.
+        inflation_of_prior: factor by which the prior in the fit was strengthened.
     """
 
+    fit: PointFit
     of_bin: Indices
     covariance_m2: Array
+    inflation_of_prior: float = 1.0
 
     def of_sums(self, influence: Array) -> Array:
         """Return the covariance (k, k) of k weighted sums of the ranges' errors, with weights (k, n)."""
@@ -284,28 +288,38 @@ class FitErrors:
         covariance: Array = of_bins @ self.covariance_m2 @ of_bins.T
         return covariance
 
-    def inflation(self, fit: PointFit, change_m: Array) -> float:
+    def inflation(self, change_m: Array) -> float:
         """Return the ratio of a parameter's standard deviation to the one for independent errors of the ranges.
 
         Args:
-            fit: the fit.
             change_m: (n,) change of the ranges per unit of the parameter, metres.
         """
-        weight = fit.weights * change_m / fit.problem.stddev_m**2
+        weight = self.fit.weights * change_m / self.fit.problem.stddev_m**2
         formal = float(weight @ change_m)
         return float(np.sqrt(max(self.of_sums(weight[None])[0, 0] / formal, 1.0))) if formal > 0 else 1.0
 
-    def inflation_of_bias(self, fit: PointFit) -> float:
-        """Return that ratio for the bias, with the position estimated along with it."""
-        root = np.sqrt(fit.weights) / fit.problem.stddev_m
-        slopes = fit.problem.slopes(fit.x)
+    def balanced(self) -> JudgedFit:
+        """Return the fit with a prior as strong beside ranges whose common errors are not in their weights.
+
+        It is strengthened by the inflation of the bias, with the position estimated along with it.
+        """
+        fit, problem = self.fit, self.fit.problem
+        root, slopes = np.sqrt(fit.weights) / problem.stddev_m, problem.slopes(fit.x)
         adapted = np.linalg.lstsq(root[:, None] * slopes[:, :3], root, rcond=None)[0]
-        return self.inflation(fit, 1.0 - slopes[:, :3] @ adapted)
+        inflation = self.inflation(1.0 - slopes[:, :3] @ adapted)
+        problem = replace(problem, prior=problem.prior * inflation)
+        return replace(self, fit=replace(fit, problem=problem, x=improve(problem, fit.x)), inflation_of_prior=inflation)
+
+    def judged_by(self, inflation: float) -> PointProblem:
+        """Return the problem with standard deviations that account for common errors, for comparing costs."""
+        problem = self.fit.problem
+        prior = problem.prior / self.inflation_of_prior
+        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=prior)
 
 
-def errors_of_fits(
+def judged_fits(
     fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], *, is_calibrated: bool
-) -> list[FitErrors]:
+) -> list[JudgedFit]:
     """Learn the errors of the ranges from the residuals of all fits together.
 
     Args:
@@ -336,4 +350,4 @@ def errors_of_fits(
         noise_m=float(precision.mean() ** -0.5),
     )
     covariance = learned.covariance_m2
-    return [FitErrors(learned.of_range[anchor_index == k], covariance) for k in range(len(fits))]
+    return [JudgedFit(fit, learned.of_range[anchor_index == k], covariance) for k, fit in enumerate(fits)]

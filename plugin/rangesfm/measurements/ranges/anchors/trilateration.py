@@ -6,9 +6,9 @@ anchor is located on its own. The errors of the ranges are learnt from those of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +18,14 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.point_fit import (
     ENOUGH_TO_JUDGE,
-    FitErrors,
+    JudgedFit,
     PointFit,
     PointProblem,
-    errors_of_fits,
     fit_with_own_noise,
     improve,
+    judged_fits,
 )
-from rangesfm.measurements.ranges.errors.noise import short_range_stddev
+from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, MIN_STDDEV_M, SAME_COST
@@ -40,6 +40,8 @@ _NONLINEAR = 0.05
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
 # Standard deviation of a known height.
 _HEIGHT_STDDEV_M = 0.01
+# Id of an anchor without one.
+_ONE = "anchor"
 
 
 @dataclass(frozen=True)
@@ -97,35 +99,21 @@ class AnchorRanges:
     Attributes:
         tag_positions_m: (n, 3) positions of the tag's antenna.
         range_m: (n,) measured ranges.
-        range_stddev_m: (n,) noise of each range, NaN where unknown; or None.
-        shared_stddev_m: (n,) standard deviation of the error that ranges of about this length share by the radio's
-            error curve; None: there is no error curve, and short ranges get a larger standard deviation.
-        timestamp_s: (n,) times of the ranges; None: they are in the order of time.
-        tag_index: (n,) index of each range's tag; None: all ranges are of one tag.
-        toward: (3,) direction from the anchor's mirror image to the anchor; or None.
+        range_stddev_m: (n,) noise of each range, NaN where unknown.
+        shared_stddev_m: (n,) standard deviation of the error that ranges of about this length share.
+        times_s: (n,) times of the ranges. tags: (n,) index of each range's tag.
+        toward: (3,) direction from the anchor's mirror image to the anchor; zero if it is not known.
         height_m: z of the anchor, if it is known.
     """
 
     tag_positions_m: Array
     range_m: Array
-    range_stddev_m: Array | None = None
-    shared_stddev_m: Array | None = None
-    timestamp_s: Array | None = None
-    tag_index: Indices | None = None
-    toward: Array | None = None
-    height_m: float | None = None
-
-    @property
-    def times_s(self) -> Array:
-        """Times of the ranges (n,), seconds; if there are none, those of a tag that somebody carries."""
-        if self.timestamp_s is not None:
-            return self.timestamp_s
-        return walking_times_s(self.tag_positions_m)
-
-    @property
-    def tags(self) -> Indices:
-        """Index of each range's tag (n,)."""
-        return np.zeros(len(self.range_m), dtype=np.int64) if self.tag_index is None else self.tag_index
+    range_stddev_m: Array
+    shared_stddev_m: Array
+    times_s: Array
+    tags: Indices
+    toward: Array
+    height_m: float | None
 
     @property
     def shape(self) -> PathShape:
@@ -135,7 +123,6 @@ class AnchorRanges:
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
         """Find the most likely position, assuming independent errors of the ranges."""
-        num = len(self.range_m)
         middle = self.tag_positions_m.mean(axis=0)
         mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
         # A known bias is held by a prior that is far stronger than any ranges.
@@ -143,42 +130,15 @@ class AnchorRanges:
         if self.height_m is not None:
             mean[2] = self.height_m - middle[2]
             prior = np.vstack([prior, [0.0, 0.0, 1 / _HEIGHT_STDDEV_M, 0.0]])
-        shared = short_range_stddev(self.range_m) if self.shared_stddev_m is None else self.shared_stddev_m
-        problem = PointProblem(self.tag_positions_m - middle, self.range_m, np.ones(num), shared, mean, prior)
-        given = np.full(num, np.nan) if self.range_stddev_m is None else self.range_stddev_m
+        centred_m, shared_m = self.tag_positions_m - middle, self.shared_stddev_m
+        problem = PointProblem(centred_m, self.range_m, np.ones(len(self.range_m)), shared_m, mean, prior)
+        given = self.range_stddev_m
         return fit_with_own_noise(problem, np.where(np.isfinite(given), given, options.range_stddev_m or np.nan))
 
 
 def walking_times_s(places_m: Array) -> Array:
     """Return (n,) times, seconds, at which somebody who walks a metre a second is at (n, 3) places, from 0."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1)))
-
-
-@dataclass(frozen=True)
-class _Found:
-    """A fit with the errors of its ranges.
-
-    Attributes:
-        fit: the fit. Its prior is strengthened by ``inflation``, to balance ranges whose common errors are not in their
-            weights.
-        errors: errors of its ranges.
-        inflation: ratio of the bias's standard deviation to the one for independent errors.
-    """
-
-    fit: PointFit
-    errors: FitErrors
-    inflation: float
-
-    def judged_by(self, inflation: float) -> PointProblem:
-        """Return the problem with standard deviations that account for common errors, for comparing costs."""
-        problem = self.fit.problem
-        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
-
-
-def _found(fit: PointFit, errors: FitErrors) -> _Found:
-    inflation = errors.inflation_of_bias(fit)
-    problem = replace(fit.problem, prior=fit.problem.prior * inflation)
-    return _Found(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
 
 @with_one_blas_thread
@@ -197,22 +157,34 @@ def trilaterate(
     the upper one comes first. With a known height, the same applies to positions that lie on a line seen from above.
 
     Args:
-        tag_positions_m, range_m, height_m: as in ``AnchorRanges``.
-        known: other attributes of ``AnchorRanges``: ``range_stddev_m``, ``shared_stddev_m``, ``timestamp_s``,
-            ``toward``.
+        tag_positions_m: (n, 3) positions of the tag's antenna. range_m: (n,) ranges.
+        height_m: z of the anchor, if it is known.
+        known: ``timestamp_s`` (n,), without which ranges are in the order of time; ``range_stddev_m`` (n,), the noise
+            of each range, NaN where unknown; ``shared_stddev_m`` (n,), of the radio's error curve at each range,
+            without which short ranges get a larger standard deviation; ``toward`` (3,), direction from the anchor's
+            mirror image to the anchor.
 
     Raises:
         GeometryError: there are too few ranges, the positions lie on a line or close together, or the anchor's standard
             deviation exceeds ``options.max_position_stddev_m``.
     """
-    positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
-    arrays: dict[str, Any] = {
-        name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
-    }
-    anchor = AnchorRanges(positions, ranges, height_m=height_m, **arrays)
-    (placement,) = _trilaterate_together({"": anchor}, options)
+    positions = np.asarray(tag_positions_m, dtype=np.float64)
+    given = {name: np.asarray(values, np.float64) for name, values in known.items() if values is not None}
+    log = RangeLog.from_arrays(
+        [_ONE] * len(positions),
+        range_m,
+        timestamp_s=given.get("timestamp_s", walking_times_s(positions)),
+        range_stddev_m=given.get("range_stddev_m"),
+    )
+    (placement,) = trilaterate_anchors(
+        replace(log, shared_stddev_m=given.get("shared_stddev_m")),
+        positions,
+        toward={_ONE: given["toward"]} if "toward" in given else {},
+        height_m={} if height_m is None else {_ONE: height_m},
+        options=options,
+    )
     if placement.found is None:
-        raise GeometryError(str(placement.why_not))
+        raise GeometryError(placement.why_not)
     return placement.found
 
 
@@ -224,13 +196,13 @@ class AnchorPlacement:
         anchor_id: id in the log.
         num_ranges: number of its ranges at known positions of the tag.
         found: its position; None if it is not determined.
-        why_not: why it is not determined; None if it is.
+        why_not: why it is not determined; empty if it is.
     """
 
     anchor_id: str
     num_ranges: int
     found: Trilateration | None
-    why_not: str | None
+    why_not: str
 
     @property
     def anchor(self) -> Anchor:
@@ -248,8 +220,8 @@ def trilaterate_anchors(
     log: RangeLog,
     tag_positions_m: Array,
     *,
-    toward: Mapping[str, Sequence[float]] | None = None,
-    height_m: Mapping[str, float] | None = None,
+    toward: Mapping[str, npt.ArrayLike] = MappingProxyType({}),
+    height_m: Mapping[str, float] = MappingProxyType({}),
     options: TrilaterationOptions = TrilaterationOptions(),
 ) -> tuple[AnchorPlacement, ...]:
     """Locate every anchor of a log; the errors of the ranges are learnt from all anchors together.
@@ -263,47 +235,37 @@ def trilaterate_anchors(
     Returns:
         One placement for each anchor, in the order of the log.
     """
-    known = np.isfinite(tag_positions_m).all(axis=1)
-    rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
-    anchors = {
-        anchor_id: AnchorRanges(
+    known, anchors = np.isfinite(tag_positions_m).all(axis=1), dict[str, AnchorRanges]()
+    for k, anchor_id in enumerate(log.anchor_ids):
+        own = np.flatnonzero(known & (log.anchor_index == k))
+        anchors[anchor_id] = AnchorRanges(
             tag_positions_m[own],
             log.range_m[own],
-            range_stddev_m=log.range_stddev_m[own],
-            shared_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[own],
-            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[own],
-            tag_index=log.tag_index[own],
-            toward=None if toward is None or anchor_id not in toward else np.asarray(toward[anchor_id], np.float64),
-            height_m=None if height_m is None else height_m.get(anchor_id),
+            log.range_stddev_m[own],
+            shared_stddev(log)[own],
+            walking_times_s(tag_positions_m[own]) if log.timestamp_s is None else log.timestamp_s[own],
+            log.tag_index[own],
+            np.asarray(toward.get(anchor_id, np.zeros(3)), np.float64),
+            height_m.get(anchor_id),
         )
-        for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
-    }
-    return _trilaterate_together(anchors, options)
-
-
-def _trilaterate_together(
-    anchors: Mapping[str, AnchorRanges], options: TrilaterationOptions
-) -> tuple[AnchorPlacement, ...]:
-    """Locate anchors of one radio system, whose ranges have errors of the same kind."""
     fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
-    fitted = [anchors[name] for name in fits]
-    times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
-    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in fitted)
-    errors = errors_of_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
-    errors_of, placements = dict(zip(fits, errors, strict=True)), []
+    times_s, tags = [anchors[name].times_s for name in fits], [anchors[name].tags for name in fits]
+    is_calibrated = log.shared_stddev_m is not None
+    judged = judged_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
+    fit_of, placements = dict(zip(fits, judged, strict=True)), []
     for name, anchor in anchors.items():
         num, found = len(anchor.range_m), None
-        why_not: str | None = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
+        why_not = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
         if name in fits:
             try:
-                found, why_not = _conclude(anchor, _found(fits[name], errors_of[name]), options), None
+                found, why_not = _conclude(anchor, fit_of[name].balanced(), options), ""
             except GeometryError as error:
                 why_not = str(error)
         placements.append(AnchorPlacement(name, num, found, why_not))
     return tuple(placements)
 
 
-def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
+def _conclude(anchor: AnchorRanges, found: JudgedFit, options: TrilaterationOptions) -> Trilateration:
     covariance, shape = _covariance(found), anchor.shape
     _refuse_uncertain(covariance, shape, options)
     # With a known height, position and mirror image have the same height, and the plane between them is vertical.
@@ -312,7 +274,7 @@ def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
         apart = (mirror - found.fit.x)[:3]
-        told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
+        told = _unless_along_plane(anchor.toward, apart)
         # If both have the same cost, the choice would depend on rounding, so the order is fixed.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
@@ -332,7 +294,7 @@ def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions
     )
 
 
-def _covariance(found: _Found) -> Array:
+def _covariance(found: JudgedFit) -> Array:
     """Return the covariance (4, 4) of position and bias, given the errors of the ranges.
 
     It is the sandwich covariance of a robust estimate: the covariance of the gradient between two inverses of the
@@ -344,7 +306,7 @@ def _covariance(found: _Found) -> Array:
     of_prior = problem.prior.T @ problem.prior
     inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
     influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
-    sandwich = found.errors.of_sums(influence) + found.inflation**2 * inverse @ of_prior @ inverse
+    sandwich = found.of_sums(influence) + found.inflation_of_prior**2 * inverse @ of_prior @ inverse
     return _with_weak_direction(found, sandwich, inverse)
 
 
@@ -358,7 +320,7 @@ def _inverse(information: Array) -> Array:
     return inverse
 
 
-def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array:
+def _with_weak_direction(found: JudgedFit, sandwich: Array, formal: Array) -> Array:
     """Return the covariance with the variance of the weakest direction from the cost itself, where that is needed.
 
     Near the plane of the tag's positions, the curvature of the cost across the plane vanishes, but the cost rises
@@ -368,7 +330,7 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
     along = np.append(axes[:, 2], 0.0)
     # The other unknowns are assumed to change with this direction as the curvature says.
     tied = formal @ along / variances[2]
-    inflation = found.errors.inflation(found.fit, found.fit.problem.slopes(found.fit.x) @ tied)
+    inflation = found.inflation(found.fit.problem.slopes(found.fit.x) @ tied)
     if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
         return sandwich
     rest = np.eye(4) - np.outer(tied, along)
@@ -376,7 +338,7 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
     return changed
 
 
-def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
+def _profile_stddev(found: JudgedFit, along: Array, inflation: float) -> float:
     """Return the distance along a direction (4,) at which the cost has risen by that of one standard deviation, metres.
 
     The other unknowns are estimated anew at each distance.
@@ -418,7 +380,7 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     )
 
 
-def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
+def _mirror(found: JudgedFit, covariance: Array, centroid: Array, across: Array) -> Array | None:
     """Return position and bias (4,) of the mirror image in the tag's positions, if it is a different one and fits."""
     height = float((found.fit.x[:3] - centroid) @ across)
     other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
@@ -428,13 +390,13 @@ def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) ->
     return other if distance > 2 * stddev and _gap(found, other) < MIN_COST_GAP else None
 
 
-def _gap(found: _Found, mirror: Array) -> float:
+def _gap(found: JudgedFit, mirror: Array) -> float:
     """Return the cost of the mirror image minus that of the fit, with common errors of the ranges accounted for.
 
     The loss is bounded, so that outliers cost the same for both.
     """
     problem = found.fit.problem
-    inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
+    inflation = found.inflation(problem.residuals_m(mirror) - found.fit.residuals_m)
     judged = found.judged_by(inflation)
     return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
 
