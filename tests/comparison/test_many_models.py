@@ -155,7 +155,7 @@ def test_a_path_without_orientations_has_no_antenna_and_so_no_range_residuals(
 def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
     result: Path, models: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
-    first, last = (compared(*models[:2]).models[0].path.image_names[i] for i in (0, -1))
+    first, last = (compared(*models[:2]).rows[0].model.path.image_names[i] for i in (0, -1))
     taped = tmp_path / "taped.csv"
     taped.write_text(f"from,to,distance_m\n{first},{last},5.0\n")
     (lengths,) = compare_many(read_named_models([result, *models[:2]]), tape=read_tape(taped)).taped.values()
@@ -174,7 +174,7 @@ def test_the_command_takes_the_log_and_the_tape(
     rangesfm_command: Command, models: tuple[Path, Path, Path], walked_survey: WalkedSurvey, tmp_path: Path
 ) -> None:
     files = walked_survey.folder
-    names = compared(*models[:2]).models[0].path.image_names
+    names = compared(*models[:2]).rows[0].model.path.image_names
     (tmp_path / "taped.csv").write_text(f"from,to,distance_m,kind\n{names[0]},{names[9]},1.25,check\n")
     log = ("--ranges", files / "uwb.csv", "--anchors", files / "anchors.csv", "--images", files / "images.csv")
     tag = ("--tag-in-cam", ",".join(map(str, TAG_IN_CAM_M)), "--ranges_time_offset", "2")
@@ -217,8 +217,8 @@ def test_a_file_of_positions_is_a_model_too(models: tuple[Path, Path, Path], wal
     assert row.base_from_model.scale == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
     base, row = compared(reference, models[0]).rows
     assert row.scale_ratio == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
-    assert base.is_metric
-    assert not row.is_metric
+    assert base.model.frame == "site"
+    assert row.model.frame is None
     with pytest.raises(InputError, match="only files of positions are given"):
         read_named_models([reference])
 

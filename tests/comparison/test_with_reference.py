@@ -123,7 +123,9 @@ def test_the_papers_table_separates_the_error_of_the_scale_from_that_of_the_shap
     truth = make_path(*walk())
     drift = np.linspace(0, 1, 30)[:, None] ** 2 * [0.5, 0.2, 0.1]
     scaled = in_first_camera(make_path(1.05 * (truth.centers + drift), truth.world_from_cam))
-    rows = papers_table(scaled, in_first_camera(truth), reference_of(truth), frame="first_camera")
+    rows = papers_table(
+        {"scaled": scaled, "refined": in_first_camera(truth)}, reference_of(truth), frame="first_camera"
+    )
     true_scale, estimated, refined = rows
     assert [row.name for row in rows] == ["true scale", "scaled", "refined"]
     assert true_scale.scale_error_percent == pytest.approx(0.0, abs=1e-9)
@@ -133,7 +135,7 @@ def test_the_papers_table_separates_the_error_of_the_scale_from_that_of_the_shap
     assert estimated.rmse_m is not None
     assert 0.01 < true_scale.rmse_m < estimated.rmse_m
     assert refined.rmse_m == pytest.approx(0.0, abs=1e-9)
-    assert len(papers_table(scaled, None, reference_of(truth))) == 2
+    assert len(papers_table({"scaled": scaled}, reference_of(truth))) == 2
 
 
 def test_a_straight_path_still_tells_its_scale() -> None:

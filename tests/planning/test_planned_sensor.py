@@ -69,9 +69,9 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     plan = plan_survey(replace(survey, sensor=PlannedSensor()))
     assert plan.scale_stddev == pytest.approx(advised.scale_stddev, rel=0.15)
     assert {*plan.by_kind} == {"ranges", "imu"}
-    assert plan.by_kind["ranges"].scale_stddev == pytest.approx(before.scale_stddev)
-    assert plan.scale_stddev < min(alone.scale_stddev for alone in plan.by_kind.values())
-    assert np.isnan(plan.by_kind["imu"].worst_keyframe_stddev_m)
+    assert plan.by_kind["ranges"].uncertainty.empirical == pytest.approx(before.scale_stddev)
+    assert plan.scale_stddev < min(alone.uncertainty.empirical for alone in plan.by_kind.values())
+    assert np.isnan(plan.by_kind["imu"].worst_keyframe_m)
     assert plan.place is not None
     assert before.place is not None
     assert plan.place.tilt_stddev_deg < 0.5 * before.place.tilt_stddev_deg

@@ -233,7 +233,7 @@ def truth(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
 
 
 def worst_keyframe(expected: Expected) -> int | None:
-    return None if expected.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
+    return None if expected.known.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
 
 
 def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 8) -> list[Row]:

@@ -191,6 +191,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
+    from rangesfm.measurements.lengths.tape import Tape
     from rangesfm.measurements.lengths.tape_file import read_tape
     from rangesfm.measurements.positions.true_positions import read_true_positions
     from rangesfm.pipeline.ranges_for_models import ranges_of_survey
@@ -202,9 +203,9 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     survey = survey_from_arguments(args)
-    models, ranges, tape = read_named_models(paths, survey), None, None
+    models, ranges, tape = read_named_models(paths, survey), None, Tape()
     if survey.ranges.path is not None:
-        model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model is not None)
+        model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model.num_images())
         ranges = ranges_of_survey(survey, model, path)
     if survey.scale.distances is not None:
         tape = read_tape(survey.scale.distances, survey.scale.markers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,23 +21,21 @@ from rangesfm.util.geometry.reference import read_reference
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.util.processes.threads import with_one_blas_thread
 
-_Pair = tuple[float, ...]
-
 
 @dataclass(frozen=True)
 class ModelComparison:
     """Comparison of two models of the same photos in the same world. All pairs are (before, after).
 
     Attributes:
-        reprojection_rms_px: None where one of the two is only a path.
-        range_rms_m, range_median_abs_m: RMS and median size of the given range residuals; None without any.
+        reprojection_rms_px: empty where one of the two is only a path.
+        range_rms_m, range_median_abs_m: RMS and median size of the given range residuals; empty without any.
         displacements_m: (n,) distance between both positions of each keyframe that both models have.
         distances: between a few keyframes spread over the path.
     """
 
-    reprojection_rms_px: _Pair | None
-    range_rms_m: _Pair | None
-    range_median_abs_m: _Pair | None
+    reprojection_rms_px: tuple[float, ...]
+    range_rms_m: tuple[float, ...]
+    range_median_abs_m: tuple[float, ...]
     displacements_m: Array
     distances: tuple[Length, ...]
 
@@ -60,14 +59,14 @@ def compare_models(
     before: pycolmap.Reconstruction | Trajectory,
     after: pycolmap.Reconstruction | Trajectory,
     *,
-    range_residuals_m: tuple[Array, Array] | None = None,
+    range_residuals_m: Sequence[Array] = (),
 ) -> ModelComparison:
     """Compare two metric models of the same photos in the same world.
 
     Args:
         before: model or path before the change.
         after: model or path after it.
-        range_residuals_m: predicted minus measured ranges, (k,) each, before and after; None without ranges.
+        range_residuals_m: predicted minus measured ranges, (k,) each, before and after; empty without ranges.
 
     Raises:
         InputError: they have no photo in common.
@@ -77,11 +76,10 @@ def compare_models(
     names, centers_before, centers_after = common_photos(*paths)
     if not names:
         raise InputError("the two models have no photo in common")
-    residuals = range_residuals_m or ()
     return ModelComparison(
-        reprojection_rms_px=tuple(map(reprojection_rms_px, models)) if len(models) == 2 else None,
-        range_rms_m=tuple(map(rms, residuals)) or None,
-        range_median_abs_m=tuple(median(np.abs(one)) for one in residuals) or None,
+        reprojection_rms_px=tuple(map(reprojection_rms_px, models)) if len(models) == 2 else (),
+        range_rms_m=tuple(map(rms, range_residuals_m)),
+        range_median_abs_m=tuple(median(np.abs(one)) for one in range_residuals_m),
         displacements_m=np.linalg.norm(centers_after - centers_before, axis=1),
         distances=lengths_along(paths),
     )
@@ -107,13 +105,13 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> str
     tables = []
     if reference_path is not None:
         path = path_in_result(scaled, result)
-        path_of_refined = None if refined is None else path.as_in(refined)
-        rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
+        paths = {"scaled": path} if refined is None else {"scaled": path, "refined": path.as_in(refined)}
+        rows = papers_table(paths, read_reference(reference_path), frame=result.summary.frame)
         tables.append(format_table(rows, result.summary.frame))
     if refined is not None:
         ranges = result.read(RangesAsUsed)
         both = [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
         known = np.isfinite(both).all(axis=0)
-        residuals_m = (both[0][known], both[1][known]) if len(both) == 2 and known.any() else None
+        residuals_m = [of_one[known] for of_one in both] if len(both) == 2 and known.any() else []
         tables.append(str(compare_models(scaled, refined, range_residuals_m=residuals_m)))
     return "\n\n".join(tables)

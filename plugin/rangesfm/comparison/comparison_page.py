@@ -26,9 +26,9 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     Raises:
         InputError: the folder cannot be written to, or a run is writing there.
     """
-    base, path = comparison.models[0], folder / "comparison.html"
-    aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
-    title = f"{len(comparison.models)} models of {len(base.path)} photos"
+    base, path = comparison.rows[0].model, folder / "comparison.html"
+    aligned = [carried_by(row.base_from_model, row.model.path) for row in comparison.rows]
+    title = f"{len(aligned)} models of {len(base.path)} photos"
     frame = base.frame or "first_camera"
     similarity, *lengths, truth = comparison.tables
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
@@ -59,14 +59,13 @@ def _unit(base: NamedModel) -> str:
 
 def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
     """Return the scene with a model's map and all paths. The first model's is last: on that, cameras are chosen."""
-    base = comparison.models[0]
-    mapped = [(row.base_from_model, one.model) for row, one in zip(comparison.rows, comparison.models) if one.model]
-    base_from_map, map_ = mapped[0]
-    points_m, points_rgb = colored_points(map_)
-    points_m = points_m if base_from_map is None else base_from_map.apply(points_m)
+    models = [row.model for row in comparison.rows]
+    base, mapped = models[0], next(row for row in comparison.rows if row.model.model.num_images())
+    points_m, points_rgb = colored_points(mapped.model.model)
+    points_m = points_m if mapped.base_from_model is None else mapped.base_from_model.apply(points_m)
     paths = [
-        ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model is not None)
-        for i, (model, path) in enumerate(zip(comparison.models, aligned))
+        ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model.num_images() > 0)
+        for i, (model, path) in enumerate(zip(models, aligned))
     ]
     return Scene(
         frame=frame,
@@ -80,12 +79,13 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
 
 def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
     """Return the figure of each camera's distance from its position in the first model; empty without any."""
-    number = {name: i for i, name in enumerate(comparison.models[0].path.image_names)}
+    base = comparison.rows[0].model
+    number = {name: i for i, name in enumerate(base.path.image_names)}
     series = []
     for i, row in enumerate(comparison.rows[1:], start=1):
         if np.isfinite(row.moved_aligned).all():
             points = np.column_stack([[number[name] + 1 for name in row.common_names], row.moved_aligned])
-            series.append(Series(row.name, _color(i), points, "line"))
+            series.append(Series(row.model.name, _color(i), points, "line"))
     if not series:
         return []
     moved = figure_of(
@@ -93,7 +93,7 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
         "Distance of each camera from its position in the first model, after the best similarity, in the unit of the "
         "first model.",
         "Distance of each camera from its position in the first model",
-        ("photo", f"moved, {_unit(comparison.models[0])}"),
+        ("photo", f"moved, {_unit(base)}"),
         series,
         y_range=from_zero(series),
         size=WIDE_SIZE,
@@ -103,12 +103,13 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
 
 def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Figure:
     panels = []
-    for view in views_of(comparison.models[0].path.centers, frame):
+    base = comparison.rows[0].model
+    for view in views_of(base.path.centers, frame):
         lines = [
-            Series(model.name, _color(i), view.seen(path.centers), "line")
-            for i, (model, path) in enumerate(zip(comparison.models, aligned))
+            Series(row.model.name, _color(i), view.seen(path.centers), "line")
+            for i, (row, path) in enumerate(zip(comparison.rows, aligned))
         ]
         limits = equal_view(np.concatenate([line.points for line in lines]))
-        panels.append(view.panel("all paths", f" {_unit(comparison.models[0])}", lines, limits))
+        panels.append(view.panel("all paths", f" {_unit(base)}", lines, limits))
     caption = "All paths after the best similarity to the first, in the frame and the unit of the first model."
     return Figure("paths", caption, tuple(panels), layout="views")

@@ -43,7 +43,7 @@ class NamedModel:
     Attributes:
         name: path from which it was read.
         path: keyframes in the world of the model.
-        model: None where only positions are known.
+        model: empty where only positions are known.
         result: result folder whose final model this is; None for other models.
         frame: world of a model in metres, as in ``compare``; None where the unit of the model is not known.
         has_orientations: whether the rotations of the path are known; otherwise they are the identity.
@@ -51,7 +51,7 @@ class NamedModel:
 
     name: str
     path: Trajectory
-    model: pycolmap.Reconstruction | None
+    model: pycolmap.Reconstruction
     result: ResultFolder | None
     frame: str | None = None
     has_orientations: bool = True
@@ -66,7 +66,6 @@ class ModelRow:
     """Comparison of one model with the first model.
 
     Attributes:
-        is_metric: whether the model is known to be in metres.
         base_from_model: best similarity from this model to the first; None with fewer than three common photos.
         common_names: names of the photos in both, in the order of the first model.
         moved, moved_aligned: (n,) distance of each common camera from its position in the first model, before and after
@@ -78,9 +77,7 @@ class ModelRow:
             ``ModelRanges.metric_path``. NaN without ranges.
     """
 
-    name: str
-    is_metric: bool
-    num_photos: int
+    model: NamedModel
     base_from_model: Similarity | None
     common_names: tuple[str, ...]
     moved: Array
@@ -106,8 +103,7 @@ class ModelsComparison:
     """Comparison of models of the same photos with the first of them.
 
     Attributes:
-        models: as given; all are compared with the first.
-        rows: one for each model.
+        rows: one for each model, as given; all are compared with the first.
         distances: between a few pairs of photos that all models have.
         taped: for the ends of each taped distance, its length by tape; its length in each model, in the unit of that
             model; and with ranges, the latter with the scale that brings the model onto ``ModelRanges.metric_path``.
@@ -115,7 +111,6 @@ class ModelsComparison:
         truth: rows of the table against a reference; empty without one.
     """
 
-    models: tuple[NamedModel, ...]
     rows: tuple[ModelRow, ...]
     distances: tuple[Length, ...]
     taped: Mapping[tuple[str, str], Sequence[float]]
@@ -124,9 +119,10 @@ class ModelsComparison:
     @property
     def tables(self) -> tuple[ReportTable, ...]:
         """Return the tables of the comparison. A table without data has no rows."""
-        cells = [_cells(row, self.models[0]) for row in self.rows]
-        names = [model.heading(model.name) for model in self.models]
-        of_row = [f"{model.name} after Sim(3) m" for model in self.models]
+        models = [row.model for row in self.rows]
+        cells = [_cells(row, models[0]) for row in self.rows]
+        names = [model.heading(model.name) for model in models]
+        of_row = [f"{model.name} after Sim(3) m" for model in models]
         of_row = of_row if any(len(lengths) > 1 + len(names) for lengths in self.taped.values()) else []
         taped = [
             [f"{a} to {b}", *(text_or_dash(length, ".4f") for length in lengths)]
@@ -181,10 +177,10 @@ def _photo_times(models: Mapping[Path, NamedModel], survey: Survey) -> dict[str,
     """Return the times of the models' photos by name; empty where they are not known."""
     path, first = next(iter(models.items()))
     times_s: dict[str, float] = {}
-    if first.model is not None and survey.images.times is not None:
+    if survey.images.times is not None:
         return dict(times_of_model(survey, first.model, path).by_name())
     with suppress(InputError):  # the names of the photos are no times
-        times_s.update(times_of_model(survey, first.model, path).by_name() if first.model is not None else {})
+        times_s.update(times_of_model(survey, first.model, path).by_name())
     for result in filter(None, map(_result_around, models)):
         times_s.update(result.timestamps_s or {})
     return times_s
@@ -199,7 +195,7 @@ def _result_around(path: Path) -> ResultFolder | None:
 def compare_many(
     models: Sequence[NamedModel],
     ranges: ModelRanges | None = None,
-    tape: Tape | None = None,
+    tape: Tape = Tape(),
     reference: Reference | None = None,
 ) -> ModelsComparison:
     """Compare models with the first of them.
@@ -207,25 +203,30 @@ def compare_many(
     Args:
         models: to compare.
         ranges: with which to compare the models; None: those of the first result folder among the models, if any.
-        tape: taped distances to measure in each model; None for none.
+        tape: taped distances to measure in each model.
         reference: true positions; None for none.
 
     Raises:
         InputError: a model has no photo in common with the first, or lacks an end of a taped distance; or the reference
             has no keyframe of a model, or is by time and the times of its photos are not known.
     """
-    own = [ranges] * len(models)
-    if ranges is None:
-        own = [None if one.result is None else ranges_of_result(one.result, one.path) for one in models]
-        ranges = next(filter(None, own), None)
+    own = [ranges or (ranges_of_result(one.result, one.path) if one.result else None) for one in models]
+    ranges = next(filter(None, own), None)
     onto_ranges: list[Similarity | None] = [None] * len(models)
     if ranges is not None:
         common = (common_photos(ranges.metric_path, model.path) for model in models)
         onto_ranges = [similarity_onto(source, target) for _, target, source in common]
-    rows = tuple(_row(models[0], *each, ranges) for each in zip(models, own, onto_ranges, strict=True))
-    taped = {} if tape is None else _taped(models, ranges, onto_ranges, tape)
+    rows = []
+    for model, own_ranges, onto in zip(models, own, onto_ranges, strict=True):
+        range_rms_m = _NO_RANGES
+        if ranges is not None and onto is not None and model.has_orientations:
+            as_it_is = rms((own_ranges or ranges).residuals_m(model.path))
+            carried = rms(ranges.residuals_m(carried_by(onto, model.path)))
+            range_rms_m = _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
+        rows.append(_row(models[0], model, range_rms_m))
+    taped = _taped(models, ranges, onto_ranges, tape)
     truth = [] if reference is None else [_truth_cells(model, reference) for model in models]
-    return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped, truth)
+    return ModelsComparison(tuple(rows), lengths_along([model.path for model in models]), taped, truth)
 
 
 def _read_model(path: Path) -> NamedModel:
@@ -252,35 +253,23 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
         centers=positions,
         world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations,
     )
-    return NamedModel(str(path), trajectory, None, None, "site", has_orientations=rotations is not None)
+    has_orientations, no_model = rotations is not None, pycolmap.Reconstruction()
+    return NamedModel(str(path), trajectory, no_model, None, "site", has_orientations=has_orientations)
 
 
-def _row(
-    base: NamedModel,
-    other: NamedModel,
-    own: ModelRanges | None,
-    onto_ranges: Similarity | None,
-    ranges: ModelRanges | None,
-) -> ModelRow:
+def _row(base: NamedModel, other: NamedModel, range_rms_m: tuple[float, float]) -> ModelRow:
     names, ours, theirs = common_photos(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
     similarity = similarity_onto(theirs, ours)
     aligned = np.full(ours.shape, np.nan) if similarity is None else similarity.apply(theirs)
-    range_rms_m = _NO_RANGES
-    if ranges is not None and onto_ranges is not None and other.has_orientations:
-        as_it_is = rms((own or ranges).residuals_m(other.path))
-        carried = rms(ranges.residuals_m(carried_by(onto_ranges, other.path)))
-        range_rms_m = _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
     return ModelRow(
-        name=other.name,
-        is_metric=other.frame is not None,
-        num_photos=len(other.path),
+        model=other,
         base_from_model=similarity,
         common_names=names,
         moved=np.linalg.norm(theirs - ours, axis=1),
         moved_aligned=np.linalg.norm(aligned - ours, axis=1),
-        reprojection_rms_px=math.nan if other.model is None else reprojection_rms_px(other.model),
+        reprojection_rms_px=reprojection_rms_px(other.model),
         range_rms_m=range_rms_m,
     )
 
@@ -297,7 +286,7 @@ def _taped(
     places = np.array(list(anchors_m.values())).reshape(-1, 3)
     lengths, lengths_m = (np.full((len(models), len(tape.distances)), np.nan) for _ in range(2))
     for k, (model, onto) in enumerate(zip(models, onto_ranges, strict=True)):
-        if model.model is None:
+        if not model.model.num_images():
             continue
         try:
             markers = markers_of_photos(tape.markers, [image.name for image in model.model.images.values()])
@@ -346,17 +335,17 @@ def _truth_cells(model: NamedModel, reference: Reference) -> Sequence[str]:
 
 def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
     """Return name and text of each cell of a row about a model and the first; the name is that of the column."""
-    aligned = row.moved_aligned
-    moved = rmse(row.moved[:, None]) if row.is_metric == (first.frame is not None) else None
+    aligned, is_metric = row.moved_aligned, row.model.frame is not None
+    moved = rmse(row.moved[:, None]) if is_metric == (first.frame is not None) else None
     return [
-        ("model", row.name),
-        ("photos in common", f"{len(row.common_names)} of {row.num_photos}"),
+        ("model", row.model.name),
+        ("photos in common", f"{len(row.common_names)} of {len(row.model.path)}"),
         ("scale / first", text_or_dash(row.scale_ratio, ".6g")),
         ("turn deg", text_or_dash(row.rotation_deg, ".3f")),
         (first.heading("moved"), text_or_dash(moved, ".4f")),
         (first.heading("after Sim(3)"), text_or_dash(rmse(aligned[:, None]), ".4f")),
         (first.heading("most"), text_or_dash(float(aligned.max()), ".4f")),
         ("reproj. px", text_or_dash(row.reprojection_rms_px, ".4f")),
-        ("range RMS m", text_or_dash(row.range_rms_m[0] if row.is_metric else None, ".4f")),
+        ("range RMS m", text_or_dash(row.range_rms_m[0] if is_metric else None, ".4f")),
         ("after Sim(3) m", text_or_dash(row.range_rms_m[1], ".4f")),
     ]

@@ -47,26 +47,16 @@ def compare(
 
 
 def papers_table(
-    scaled: Trajectory,
-    refined: Trajectory | None,
-    reference: Reference,
-    *,
-    frame: str = "site",
-    loops_open: Trajectory | None = None,
+    paths: Mapping[str, Trajectory], reference: Reference, *, frame: str = "site"
 ) -> tuple[ComparisonRow, ...]:
-    """Return the table of the 2018 paper: with the true scale, scaled and, if there is one, refined.
+    """Return the table of the 2018 paper: the first of some metric paths with the true scale, and each as it is.
 
     Args:
-        scaled: metric path before the refinement.
-        refined: metric path after it; None without one.
-        reference: as in ``compare``.
-        frame: as in ``compare``.
-        loops_open: the refined path before its loops were closed, which gives a further row; None without loops.
+        paths: by name, such as "scaled" and "refined".
+        reference, frame: as in ``compare``.
     """
-    paths = {"true scale": with_true_scale(scaled, reference, frame=frame), "scaled": scaled}
-    further = {"refined, loops open": loops_open, "refined": refined}
-    paths |= {name: path for name, path in further.items() if path is not None}
-    return compare(paths, reference, frame=frame)
+    true_scale = with_true_scale(next(iter(paths.values())), reference, frame=frame)
+    return compare({"true scale": true_scale, **paths}, reference, frame=frame)
 
 
 def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "site") -> Trajectory:

@@ -101,12 +101,14 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
     """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
     if inputs.reference is None:
         return ()
-    frame = metric.estimate.frame
-    scaled = metric.trajectory.as_in(metric.scaled)
-    refined = None if metric.kept is None else metric.trajectory.as_in(metric.final)
-    loops_open = None if metric.kept is None or metric.kept.loops is None else metric.kept.loops.before
-    rows = papers_table(scaled, refined, inputs.reference, frame=frame, loops_open=loops_open)
-    in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
+    frame, paths = metric.estimate.frame, {"scaled": metric.trajectory.as_in(metric.scaled)}
+    if metric.kept is not None:
+        if metric.kept.loops is not None and metric.kept.loops.before is not None:
+            paths["refined, loops open"] = metric.kept.loops.before
+        paths["refined"] = metric.trajectory.as_in(metric.final)
+    rows = papers_table(paths, inputs.reference, frame=frame)
+    *_, final = paths.values()
+    in_frame = reference_in_frame(final, inputs.reference, frame=frame)
     if in_frame is not None:
         write_reference(in_frame, folder / REFERENCE_NAME)
     return rows

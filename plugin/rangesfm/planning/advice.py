@@ -174,10 +174,16 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         yield "wider path", "", f"walk {factor:g} times as wide", replace(planned, trajectory=_wider(path, factor))
     if planned.anchors:
         yield "rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz)
-    if planned.allowed_m is None and planned.anchors:
-        yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned)
+    if not len(planned.allowed_m) and planned.anchors:
+        moved = zip(planned.anchors, _farther_out(path, planned.anchors_m, _WIDER), strict=True)
+        spread = replace(planned, anchors=tuple(replace(anchor, position_m=at) for anchor, at in moved))
+        yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", spread
     if planned.curve_stddev_m is None and planned.anchors:
-        yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned)
+        # The calibration changes some of the error components, whose given values then do not hold.
+        taken = {component.name for component in COMPONENTS if component.calibrated_median is not None}
+        left = {name: stddev for name, stddev in planned.component_stddevs.items() if name not in taken}
+        calibrated = replace(planned, curve_stddev_m=_LEARNT_CURVE_M, component_stddevs=left)
+        yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", calibrated
     if planned.num_ranges < FEW_RANGES and planned.anchors:
         again = f"walk the path {_NUM_AGAIN} times, there and back"
         if len(path) > 1:
@@ -186,11 +192,8 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
             often = replace(planned, rate_hz=factor * planned.rate_hz)
             yield "rate", "", f"range {factor} times as often", often
     if planned.sensor is None and planned.times_are_known:
-        sensor, with_sensor = (
-            "record the inertial sensor of a phone on the camera",
-            replace(planned, sensor=PlannedSensor()),
-        )
-        yield "inertial sensor", "", sensor, with_sensor
+        sensor = "record the inertial sensor of a phone on the camera"
+        yield "inertial sensor", "", sensor, replace(planned, sensor=PlannedSensor())
     if planned.sensor is not None:
         tilt = f"tilt the camera up, down and to the sides on the way, by {_TILTED_DEG:g} degrees, {NUM_WAVES} times"
         yield "tilted camera", "", tilt, replace(planned, trajectory=_tilted(path))
@@ -211,18 +214,6 @@ def _leads_through_walls(before: PlannedSurvey, after: PlannedSurvey) -> bool:
     start = np.vstack([start, before.anchors_m[:num, :2]])
     end = np.vstack([end, after.anchors_m[:num, :2]])
     return bool(lead_through(start, end, before.walls_m).any())
-
-
-def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
-    """Return the plan with a calibrated radio, without the given values of error components that this changes."""
-    taken = {component.name for component in COMPONENTS if component.calibrated_median is not None}
-    left = {name: stddev for name, stddev in planned.component_stddevs.items() if name not in taken}
-    return replace(planned, curve_stddev_m=_LEARNT_CURVE_M, component_stddevs=left)
-
-
-def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
-    moved = zip(planned.anchors, _farther_out(planned.trajectory, planned.anchors_m, _WIDER), strict=True)
-    return replace(planned, anchors=tuple(replace(anchor, position_m=at) for anchor, at in moved))
 
 
 def _farther_out(path: Trajectory, places_m: Array, factor: float) -> Array:
@@ -251,7 +242,7 @@ def _ground_m(planned: PlannedSurvey) -> float:
 
 def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
-    for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
+    for k, anchor in enumerate(planned.anchors if len(planned.allowed_m) else ()):
         for place in places:
             words = f"move anchor {anchor.anchor_id} to {planned.site.place_text(place)}{planned.axes}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
@@ -301,7 +292,7 @@ def _free_places(planned: PlannedSurvey) -> list[Array]:
     They are the allowed places farthest apart. If none are given, they are eight points on the outline of the box
     around path and anchors, at the anchors' median height.
     """
-    if planned.allowed_m is not None:
+    if len(planned.allowed_m):
         spread = spread_places(min(_NUM_PLACES, len(planned.allowed_m)), planned.allowed_m)
     else:
         low, high = planned.places_m.min(axis=0), planned.places_m.max(axis=0)

@@ -68,12 +68,12 @@ class RangesAtTruth:
 
     Attributes:
         posed: the scale problem. solution: its true state, with the weight of each range.
-        observed: the ranges, of which the robust weights assume what differs from range to range.
+        learned: errors to expect of them, with those of the map's bending.
     """
 
     posed: ScaleProblem
     solution: Solution
-    observed: BinnedRanges
+    learned: LearnedErrors
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,6 @@ class Expected:
         vision: information of its photos; None: the map bends as maps of poses do.
         ranges: its ranges; None without any.
         known: uncertainty of the map as a whole.
-        learned: errors to expect of the ranges, with those of the map's bending; None without any.
         keyframe_stddevs_m: (n,) roots of the summed variances of each keyframe's position in the result's frame, after
             ranges and known positions have straightened the map; inf if not determined.
         num_positions: number of known positions that hold the map.
@@ -98,7 +97,6 @@ class Expected:
     vision: VisionInformation | None
     ranges: RangesAtTruth | None
     known: Posterior
-    learned: LearnedErrors | None
     keyframe_stddevs_m: Array
     num_positions: int
     notes: tuple[str, ...]
@@ -112,7 +110,7 @@ class Expected:
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
         known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(0), np.zeros(0))
         open_m = np.full(len(planned.trajectory), np.inf)
-        return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal=refusal)
+        return cls(replace(planned, photos=None), None, None, known, open_m, 0, (), refusal=refusal)
 
     @property
     def uncertainty(self) -> ScaleUncertainty:
@@ -147,16 +145,16 @@ class Expected:
         """The upward direction in the first camera, as the inertial sensor tells it; None without one."""
         return None if self.sensor is None else self.sensor.upward
 
-    def mirror_image(self) -> str | None:
-        """Return why the run will leave the position open, or None if it will not.
+    def mirror_image(self) -> str:
+        """Return why the run will leave the position open; empty if it will not.
 
         The position is open if the map's mirror image in the anchors' plane fits ranges as they may turn out.
         """
         if self.ranges is None or self.num_positions or self.frame != "site":
-            return None
+            return ""
         mirrored = mirrored_map(self.ranges.posed.ranges, self.ranges.solution.fit.state)
         if mirrored is None:
-            return None
+            return ""
         try:
             # For a path in that plane the height is not determined, and the solver divides 0 by 0.
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -165,30 +163,25 @@ class Expected:
                 refuse_ambiguity(solution, [mirrored], None)
         except GeometryError as error:
             return str(error)
-        return None
+        return ""
 
     def turned_out(self, seed: int) -> RangeObservations:
         """Return the ranges with errors drawn from those to expect."""
         assert self.ranges is not None, "a plan with ranges"
-        assert self.learned is not None, "errors of ranges"
-        rng, learned, observations = np.random.default_rng(seed), self.learned, self.ranges.posed.observations
+        posed, learned, rng = self.ranges.posed, self.ranges.learned, np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(learned.without("white").covariance_m2)
         of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         white_m = learned.stddev_of_component["white"] / np.sqrt(self.planned.num_alike)
-        range_m = observations.log.range_m.copy()
-        range_m[self.ranges.posed.rows] += of_bins[learned.of_range]
-        range_m[self.ranges.posed.rows] += white_m * rng.standard_normal(len(learned.of_range))
-        return replace(observations, log=replace(observations.log, range_m=np.maximum(range_m, LENGTH_M.least)))
-
-    @property
-    def placement(self) -> Array | None:
-        """(7, 7) covariance of the map's similarity about the first camera, as of a ScaleEstimate; None: not placed."""
-        return self.known.placement
+        range_m = posed.observations.log.range_m.copy()
+        range_m[posed.rows] += of_bins[learned.of_range]
+        range_m[posed.rows] += white_m * rng.standard_normal(len(learned.of_range))
+        log = replace(posed.observations.log, range_m=np.maximum(range_m, LENGTH_M.least))
+        return replace(posed.observations, log=log)
 
     @property
     def map_stddevs(self) -> Array | None:
         """Standard deviations (7,) of the map's similarity about its mean; inf: not determined, None: not placed."""
-        placement = self.placement
+        placement = self.known.placement
         if placement is None:
             return None
         return _stddevs(np.diag(by_similarity(placement, self.planned.trajectory.centers)[0]))
@@ -199,7 +192,7 @@ class Expected:
         Each is the root of the summed variances of the three coordinates in the result's frame. If the map is not
         placed in the site, only the scale contributes, with the first camera fixed.
         """
-        motions, placement = similarity_motions(places_m - self.planned.trajectory.centers[0]), self.placement
+        motions, placement = similarity_motions(places_m - self.planned.trajectory.centers[0]), self.known.placement
         if placement is None:
             placement = np.diag([self.uncertainty.empirical**2, *np.zeros(6)])
         return _stddevs(np.einsum("nij,jk,nik->n", motions, placement, motions))
@@ -246,19 +239,22 @@ def expect(
     positions, placement, notes = _positions(planned, the_map, max_num_bins)
     sensor, why_not = _sensor(planned, the_map)
     gravity = None if sensor is None or not planned.anchors else sensor.upward
-    ranges = _ranges(planned, placement, gravity, max_num_bins) if planned.anchors else None
-    observed: list[Observations] = [] if ranges is None else [ranges.observed]
-    observed += [] if positions is None else [positions]
+    observed: list[Observations] = [] if positions is None else [positions]
+    if planned.anchors:
+        posed, solution, binned = _ranges(planned, placement, gravity, max_num_bins)
+        observed.insert(0, binned)
     if planned.taped:
         observed.append(lengths_on_map(planned.taped_lengths, 1.0, path, np.ones(len(planned.taped), dtype=bool)))
     if sensor is not None:
         most = max_num_bins // 2 if observed else max_num_bins
         observed.append(sensor.observed(sensor.start, in_site=placement is not None, max_num=most))
     problem, known, keyframe_stddevs_m = the_map.solved(observed)
-    learned = None if ranges is None else LearnedErrors.from_noise(problem.noise_of(RANGES), ranges.observed.bins)
+    ranges = None
+    if planned.anchors:
+        ranges = RangesAtTruth(posed, solution, LearnedErrors.from_noise(problem.noise_of(RANGES), binned.bins))
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
     notes = (*notes, *why_not)
-    return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes, sensor)
+    return Expected(planned, vision, ranges, known, keyframe_stddevs_m, num_positions, notes, sensor)
 
 
 def _positions(
@@ -294,7 +290,8 @@ def _sensor(planned: PlannedSurvey, the_map: _BendingMap) -> tuple[PlannedScale 
 
 def _ranges(
     planned: PlannedSurvey, placement: PlacementPrior | None, gravity: Gravity | None, max_num_bins: int
-) -> RangesAtTruth:
+) -> tuple[ScaleProblem, Solution, BinnedRanges]:
+    """Return the scale problem of the ranges, its true state, and the ranges, which are weighted by their noise."""
     posed = planned.posed(planned.observations(), placement, gravity)
     state = planned.state(posed)
     tags, scale = antenna_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
@@ -305,7 +302,7 @@ def _ranges(
     found = binned_ranges(posed, solution, max_num_bins)
     sizes = _given_or_usual(found.components, planned.given_sizes)
     alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
-    return RangesAtTruth(posed, solution, replace(found, alone_m2=alone))
+    return posed, solution, replace(found, alone_m2=alone)
 
 
 def _given_or_usual(components: Sequence[Component], given: Mapping[str, float]) -> dict[str, float]:

@@ -74,7 +74,7 @@ def place_anchors(planned: PlannedSurvey, progress: Progress = SILENT) -> Planne
     standard deviation and the least certain keyframe's standard deviation is minimized, or the first alone if the map
     is not placed in the site.
     """
-    if planned.is_placed or planned.allowed_m is None:
+    if planned.is_placed or not len(planned.allowed_m):
         return planned
     best = _badness(planned)
     progress.stage("placing anchors")

@@ -74,9 +74,10 @@ class PlannedAnchorOptions(Options, table="anchors"):
     ] = None
     """Two opposite corners x, y, z of the box in which anchors may be placed."""
     walls_m: Annotated[
-        Annotated[tuple[_Corners, ...], Field(strict=False)] | None,
+        tuple[_Corners, ...],
+        Field(strict=False),
         Key(expected="a list of walls, each a list of 2 corners x, y or more"),
-    ] = None
+    ] = ()
     """Walls on which anchors may be placed instead, at heights_m: each a list of corners x, y as seen from above."""
     heights_m: Annotated[_Heights | None, _HEIGHTS] = None
     """Lowest and highest height of anchors (default: not below the ground)."""
@@ -85,14 +86,13 @@ class PlannedAnchorOptions(Options, table="anchors"):
 class PlannedPathOptions(Options, table="path"):
     """Planned path of the camera: waypoints, a loop, a trajectory, or a model."""
 
-    waypoints: Annotated[
-        Annotated[tuple[Place, ...], Field(strict=False)] | None, Key(expected="a list of lists of 3 numbers")
-    ] = None
+    waypoints: Annotated[tuple[Place, ...], Field(strict=False), Key(expected="a list of lists of 3 numbers")] = ()
     """Points x, y, z in the site that the camera passes; it looks ahead, and its path is rounded off at corners."""
     loop_inside_m: Annotated[
-        Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
+        tuple[_Spot, ...],
+        Field(strict=False, min_length=3),
         Key(expected="a list of 3 corners x, y or more"),
-    ] = None
+    ] = ()
     """Corners of a floor instead; a loop two thirds as wide is walked in it, up and down between heights_m."""
     heights_m: Annotated[_Heights, _HEIGHTS] = (1.2, 2.0)
     """Lowest and highest height of the camera on that loop."""
@@ -192,10 +192,10 @@ def _checked(
     def point_key(name: str) -> str:
         return "path" if points is None or points.path else f"places.{name}"
 
-    path_key = next(name for name in _PATHS if getattr(path, name) is not None)
-    floors_m = [] if path.loop_inside_m is None else [planned.walls_m[-1]]
+    path_key = next(name for name in _PATHS if getattr(path, name))
+    floors_m = [planned.walls_m[-1]] if path.loop_inside_m else []
     require_possible(planned, floors_m, path_key, anchor_key, point_key)
-    return list(oddities(planned, [np.array(wall) for wall in anchors.walls_m or ()], path_key, anchor_key))
+    return list(oddities(planned, [np.array(wall) for wall in anchors.walls_m], path_key, anchor_key))
 
 
 def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
@@ -257,7 +257,7 @@ def _planned(
 
 
 def _require_one(options: Options, *names: str) -> None:
-    given = [name for name in names if getattr(options, name) not in (None, {})]
+    given = [name for name in names if getattr(options, name)]
     if len(given) != 1:
         found, known = " and ".join(given) or "none", f"{', '.join(names[:-1])} and {names[-1]}"
         raise OptionError(f"[{options.table}] has {found} of {known}, expected one", options.table)
@@ -277,14 +277,14 @@ def _path(path: PlannedPathOptions) -> Trajectory:
         return path_from_file(path.file, path.photo_rate_hz)
     if path.model is not None:
         return path_from_model(path.model, path.photo_rate_hz)
-    waypoints = path.waypoints or loop_inside(path.loop_inside_m or (), path.heights_m)
+    waypoints = path.waypoints or loop_inside(path.loop_inside_m, path.heights_m)
     return path_through(waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds, path.turn_deg_per_s)
 
 
-def _allowed(options: PlannedAnchorOptions) -> Array | None:
-    """Return the places where anchors may be put (k, 3), or None if the plan gives none."""
-    if options.walls_m is None:
-        return None if options.region_m is None else places_in_box(*options.region_m)
+def _allowed(options: PlannedAnchorOptions) -> Array:
+    """Return the places where anchors may be put (k, 3); empty if the plan gives none."""
+    if not options.walls_m:
+        return np.zeros((0, 3)) if options.region_m is None else places_in_box(*options.region_m)
     if options.region_m is not None or options.heights_m is None:
         raise options.refused("walls_m", "goes with heights_m and without region_m")
     return places_on_walls(options.walls_m, options.heights_m)
@@ -292,20 +292,16 @@ def _allowed(options: PlannedAnchorOptions) -> Array | None:
 
 def _walls(anchors: PlannedAnchorOptions, path: PlannedPathOptions) -> tuple[Array, ...]:
     """Return the walls, and the outline of the floor, as corners (k, 2)."""
-    floor = () if path.loop_inside_m is None else ((*path.loop_inside_m, path.loop_inside_m[0]),)
-    return tuple(np.array(corners, dtype=np.float64) for corners in (*(anchors.walls_m or ()), *floor))
+    floor = [(*path.loop_inside_m, path.loop_inside_m[0])] if path.loop_inside_m else []
+    return tuple(np.array(corners, dtype=np.float64) for corners in (*anchors.walls_m, *floor))
 
 
-def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[Anchor, ...]:
+def _anchors(options: PlannedAnchorOptions, allowed_m: Array) -> tuple[Anchor, ...]:
     _require_one(options, "path", "places", "num_to_place")
     if options.num_to_place is not None:
-        num_allowed = 0 if allowed_m is None else len(allowed_m)
-        if allowed_m is None or num_allowed < options.num_to_place:
-            raise options.refused(
-                "num_to_place",
-                f"is {options.num_to_place} and there are {num_allowed} places to choose from, expected a larger "
-                "region_m or walls_m",
-            )
+        if len(allowed_m) < options.num_to_place:
+            found = f"is {options.num_to_place} and there are {len(allowed_m)} places to choose from"
+            raise options.refused("num_to_place", f"{found}, expected a larger region_m or walls_m")
         return spread_anchors(options.num_to_place, allowed_m, options.position_stddev_m)
     if options.path is None:
         anchors = tuple(

@@ -83,7 +83,7 @@ class PlannedSurvey:
         photos: field of view and features of the camera; None: the map bends as maps of poses usually do.
         points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
         sensor: inertial sensor on the camera; None without one.
-        allowed_m: (k, 3) allowed places for anchors; None: not given.
+        allowed_m: (k, 3) allowed places for anchors; empty: not given.
         walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
         walls_are: what the walls are, in words.
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
@@ -109,7 +109,7 @@ class PlannedSurvey:
     sensor: PlannedSensor | None = None
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
-    allowed_m: Array | None = None
+    allowed_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     walls_m: tuple[Array, ...] = ()
     walls_are: str = "walls"
     is_placed: bool = True

@@ -61,19 +61,6 @@ class PlannedPlace:
 
 
 @dataclass(frozen=True)
-class PlannedByKind:
-    """Uncertainty by one kind of measurement alone.
-
-    Attributes:
-        scale_stddev: relative standard deviation of the scale; inf if a run refuses it.
-        worst_keyframe_stddev_m: as in PlannedPlace; NaN if the map is not placed in the site.
-    """
-
-    scale_stddev: float
-    worst_keyframe_stddev_m: float
-
-
-@dataclass(frozen=True)
 class SurveyPlan:
     """Expected result of a planned survey, as a run will state it.
 
@@ -90,7 +77,7 @@ class SurveyPlan:
         keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
         verdict, reasons: the run's verdict on the scale; "refused" if it will refuse the scale.
         up_stddev_deg: standard deviation of the vertical by the inertial sensor; None without one.
-        by_kind: what each kind of ``ALONE`` would give alone; empty where the plan has one of them.
+        by_kind: the same by each kind of ``ALONE`` alone; empty where the plan has one of them.
         warnings: what is odd about the plan, and what a run will leave out.
         mistakes: for each possible mistake the smallest size that would be found (None: no size that can happen), and
             the largest effect of a mistake that is not found, the largest on the scale first (None: without limit).
@@ -111,7 +98,7 @@ class SurveyPlan:
     verdict: str
     reasons: tuple[str, ...]
     up_stddev_deg: float | None
-    by_kind: dict[str, PlannedByKind]
+    by_kind: dict[str, Expected]
     warnings: tuple[str, ...]
     mistakes: tuple[MistakeTest, ...]
     advice: tuple[Advice, ...]
@@ -153,10 +140,15 @@ class SurveyPlan:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON, with null for numbers that are not finite, and the advice in both orders."""
-        content: dict[str, Any] = _finite(self)
+        alone = {
+            kind: {"scale_stddev": each.uncertainty.empirical, "worst_keyframe_stddev_m": each.worst_keyframe_m}
+            for kind, each in self.by_kind.items()
+        }
+        content = {part.name: _finite(getattr(self, part.name)) for part in fields(self) if part.repr}
         del content["advice"]
         names = ("name", "subject", "unit", *_SIZES)
         return content | {
+            "by_kind": _finite(alone),
             "mistakes": [{name: each[name] for name in names} for each in content["mistakes"]],
             "advice_for_scale": _finite(self.advice_for_scale),
             "advice_for_place": _finite(self.advice_for_place),
@@ -210,7 +202,7 @@ def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
     return verdict.verdict, tuple(verdict.reasons)
 
 
-def _by_kind(planned: PlannedSurvey) -> dict[str, PlannedByKind]:
+def _by_kind(planned: PlannedSurvey) -> dict[str, Expected]:
     nothing = replace(planned, anchors=(), points=(), antenna=None, sensor=None)
     alone = {
         "ranges": planned.anchors and replace(nothing, anchors=planned.anchors),
@@ -219,9 +211,7 @@ def _by_kind(planned: PlannedSurvey) -> dict[str, PlannedByKind]:
         "imu": planned.sensor and replace(nothing, sensor=planned.sensor),
     }
     found = {kind: _expect(each) for kind, each in alone.items() if each}
-    if len(found) == 1:
-        return {}
-    return {kind: PlannedByKind(each.uncertainty.empirical, each.worst_keyframe_m) for kind, each in found.items()}
+    return found if len(found) > 1 else {}
 
 
 def _place(expected: Expected) -> PlannedPlace | None:
@@ -233,7 +223,7 @@ def _place(expected: Expected) -> PlannedPlace | None:
     verdict, reasons = "doubtful" if is_wide else "good", [words]
     if expected.refusal:
         verdict, reasons = OPEN_PLACE, ["a run will not place the map: it will refuse its scale"]
-    elif (open_place := expected.mirror_image()) is not None:
+    elif open_place := expected.mirror_image():
         verdict, reasons = OPEN_PLACE, [f"a run will give metres, but no place in the site: {open_place}", words]
     x_m, y_m, z_m = of_map[4:].tolist()
     return PlannedPlace(
@@ -252,10 +242,10 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
 
     Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
     """
-    ranges, learned = expected.ranges, expected.learned
-    if ranges is None or learned is None:
+    ranges = expected.ranges
+    if ranges is None:
         return ()
-    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, None), learned)
+    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, None), ranges.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):
@@ -307,11 +297,9 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
 
 def _alone(plan: SurveyPlan) -> Iterator[str]:
     for kind, alone in plan.by_kind.items():
-        scale = f"scale +-{_rough(100 * NORMAL_95 * alone.scale_stddev, '%')}"
-        is_placed = not np.isnan(alone.worst_keyframe_stddev_m)
-        place = (
-            f", least certain keyframe {_half_width_95(alone.worst_keyframe_stddev_m)}" if is_placed else ", no place"
-        )
+        scale = f"scale +-{_rough(100 * NORMAL_95 * alone.uncertainty.empirical, '%')}"
+        is_placed = not np.isnan(alone.worst_keyframe_m)
+        place = f", least certain keyframe {_half_width_95(alone.worst_keyframe_m)}" if is_placed else ", no place"
         yield f"{ALONE[kind]} (95 %): {scale}{place}"
 
 

@@ -212,10 +212,8 @@ def _by_kind(plan: SurveyPlan) -> ReportTable:
     rows = [
         [
             ALONE[kind],
-            percent(NORMAL_95 * alone.scale_stddev),
-            "no place"
-            if math.isnan(alone.worst_keyframe_stddev_m)
-            else _half_width_95(alone.worst_keyframe_stddev_m, "m"),
+            percent(NORMAL_95 * alone.uncertainty.empirical),
+            "no place" if math.isnan(alone.worst_keyframe_m) else _half_width_95(alone.worst_keyframe_m, "m"),
         ]
         for kind, alone in plan.by_kind.items()
     ]
