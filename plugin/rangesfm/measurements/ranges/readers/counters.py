@@ -32,6 +32,7 @@ class Counter(NamedTuple):
     """A counter that begins again at 0.
 
     Attributes:
+        bits, period: its size, and after how much it begins again, in the unit of the file.
         num_wraps: how often it begins again.
     """
 

@@ -47,6 +47,9 @@ Ask = Callable[[Sequence[str], str], InputError]
 def time_unit(name: str, times: Array, notes: list[str], ask: Ask, slowest_s: float = SLOWEST_S) -> str:
     """Return the unit of a column of times, and add a note if it is not from the name.
 
+    Args:
+        slowest_s: largest plausible median step between times.
+
     Raises:
         InputError: the unit is ambiguous.
     """
