@@ -15,7 +15,7 @@ from rangesfm.cli import main
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
 from rangesfm.options import BIAS_M, COORDINATE_M, LENGTH_M, PIXEL, STDDEV_M, TIME_S
-from rangesfm.sfm.image_times import times_from_exif, times_from_file_names
+from rangesfm.sfm.image_times import find_image_times
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -151,7 +151,7 @@ def test_places_of_anchors_in_a_log_have_the_same_bounds_as_in_a_table(tmp_path:
 
 @pytest.mark.parametrize("name", ["9" * 400, "9" * 5000, f"{'9' * 30}.500"])
 def test_a_photos_name_of_very_many_digits_is_no_time(name: str) -> None:
-    times = times_from_file_names([*(f"{k}.{k}00.jpg" for k in range(1, 4)), f"{name}.jpg"])
+    times = find_image_times("nowhere", [*(f"{k}.{k}00.jpg" for k in range(1, 4)), f"{name}.jpg"])
     assert times.num_left_out == 1
 
 
@@ -160,7 +160,7 @@ def test_a_photo_of_the_year_1_is_taken_to_have_no_time(tmp_path: Path) -> None:
         image, exif = Image.new("L", (8, 8)), Image.Exif()
         exif.get_ifd(0x8769).update({0x9003: date, 0x9011: "+14:00"})
         image.save(tmp_path / f"{k}.jpg", exif=exif)
-    times = times_from_exif(tmp_path, ["0.jpg", "1.jpg", "2.jpg"])
+    times = find_image_times(tmp_path, ["0.jpg", "1.jpg", "2.jpg"])
     assert times.image_names == ("1.jpg", "2.jpg")
 
 

@@ -9,14 +9,14 @@ import pytest
 
 from rangesfm.colmap.model_files import model_of_trajectory
 from rangesfm.errors import InputError
-from rangesfm.sfm.image_times import times_from_file_names
+from rangesfm.sfm.image_times import find_image_times
 
 
 def test_poses_of_a_tum_file_are_photos_with_times(tmp_path: Path) -> None:
     path = tmp_path / "KeyFrameTrajectory.txt"
     path.write_text("1305031102.175304 1 2 3 0 0 0 1\n1305031103.5 4 5 6 0.5 0.5 0.5 0.5\n")
     images = sorted(model_of_trajectory(path).images.values(), key=lambda image: image.name)
-    times = times_from_file_names([image.name for image in images])
+    times = find_image_times("nowhere", [image.name for image in images])
     np.testing.assert_allclose(times.timestamps_s, [1305031102.175304, 1305031103.5], atol=1e-6)
     np.testing.assert_allclose([image.projection_center() for image in images], [[1, 2, 3], [4, 5, 6]])
     rotation = images[1].cam_from_world().rotation

@@ -11,8 +11,6 @@ from rangesfm.sfm.image_times import (
     find_image_times,
     list_images,
     read_image_times_csv,
-    times_from_exif,
-    times_from_file_names,
 )
 
 NEW_YEAR_2026_S = 1767225600.0
@@ -142,7 +140,7 @@ class TestExif:
     def test_reads_the_fraction_as_decimals_and_the_zone(self, tmp_path: Path) -> None:
         write_photo(tmp_path / "a.jpg", "2026:01:01 02:00:00", "05", "+02:00")
         write_photo(tmp_path / "b.jpg", "2025:12:31 19:00:01", "125", "-05:00")
-        times = times_from_exif(tmp_path, ["b.jpg", "a.jpg"])
+        times = find_image_times(tmp_path, ["b.jpg", "a.jpg"])
         assert times.image_names == ("a.jpg", "b.jpg")
         assert np.allclose(times.timestamps_s - NEW_YEAR_2026_S, [0.05, 1.125], rtol=0, atol=1e-6)
         assert (times.source, times.resolution_s, times.notes) == ("exif", 0.001, ())
@@ -150,7 +148,7 @@ class TestExif:
     def test_without_a_zone_the_clock_is_taken_for_utc_and_whole_seconds_are_noted(self, tmp_path: Path) -> None:
         write_photo(tmp_path / "a.jpg", "2026:01:01 00:00:00")
         write_photo(tmp_path / "b.jpg", "2026:01:01 00:00:02")
-        times = times_from_exif(tmp_path, ["a.jpg", "b.jpg"])
+        times = find_image_times(tmp_path, ["a.jpg", "b.jpg"])
         assert np.array_equal(times.timestamps_s - NEW_YEAR_2026_S, [0.0, 2.0])
         assert times.resolution_s == 1.0
         assert "whole seconds" in times.notes[0]
@@ -158,7 +156,7 @@ class TestExif:
     def test_a_photo_without_a_zone_has_that_of_the_others(self, tmp_path: Path) -> None:
         write_photo(tmp_path / "a.jpg", "2026:01:01 01:00:00", offset="+01:00")
         write_photo(tmp_path / "b.jpg", "2026:01:01 01:00:02")
-        assert times_from_exif(tmp_path, ["a.jpg", "b.jpg"]).timestamps_s[1] == NEW_YEAR_2026_S + 2
+        assert find_image_times(tmp_path, ["a.jpg", "b.jpg"]).timestamps_s[1] == NEW_YEAR_2026_S + 2
 
     def test_leaves_out_photos_without_time_and_those_of_a_second_that_has_one(self, tmp_path: Path) -> None:
         for name in ("a.jpg", "b.jpg"):
@@ -166,7 +164,7 @@ class TestExif:
         write_photo(tmp_path / "c.jpg", "2026:01:01 00:00:01")
         write_photo(tmp_path / "d.jpg", "0000:00:00 00:00:00")
         (tmp_path / "e.jpg").write_bytes(b"no photo")
-        times = times_from_exif(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"])
+        times = find_image_times(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"])
         assert times.image_names == ("a.jpg", "c.jpg")
         assert times.num_left_out == 3
         assert times.notes[:2] == (
@@ -191,7 +189,7 @@ class TestFileNames:
     def test_are_times_in_the_unit_that_their_size_says(
         self, names: tuple[str, str], seconds: tuple[float, float], resolution_s: float
     ) -> None:
-        times = times_from_file_names(names)
+        times = find_image_times("nowhere", names)
         assert times.image_names == names
         assert times.timestamps_s[0] == pytest.approx(seconds[0], abs=1e-6)
         assert times.timestamps_s[1] - times.timestamps_s[0] == pytest.approx(seconds[1], abs=1e-6)
@@ -209,8 +207,8 @@ class TestFileNames:
         ],
     )
     def test_frame_numbers_and_dates_are_not_taken_for_times(self, names: tuple[str, str]) -> None:
-        with pytest.raises(InputError, match=f"no time in its name, the first is {names[0]}; expected a CSV file"):
-            times_from_file_names(names)
+        with pytest.raises(InputError, match=f"no time for {names[0]}: expected a CSV file"):
+            find_image_times("nowhere", names)
 
 
 class TestFindImageTimes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -108,7 +107,8 @@ def find_image_times(
 ) -> ImageTimes:
     """Find the times of the photos ``names`` in ``folder``.
 
-    They are from the CSV file if given, else by the fixed rate if given, else from EXIF or the names.
+    They are from the CSV file if given, else by the fixed rate if given, else from EXIF or the names, whichever gives
+    more than half of the photos a time.
 
     Args:
         rate_hz: fixed rate at which the photos were taken; ``names`` are then all of them.
@@ -121,10 +121,10 @@ def find_image_times(
         return read_image_times_csv(csv_path, names, frames, columns=columns, unit=unit)
     if rate_hz is not None:
         return times_at_rate(names, rate_hz)
-    with suppress(InputError):
-        return times_from_exif(folder, names)
-    with suppress(InputError):
-        return times_from_file_names(names)
+    if 2 * len(stamps := _stamps_by_exif(Path(folder), names)) > len(names):
+        return _in_time_order(stamps, names, "exif")
+    if 2 * len(stamps := _stamps_by_names(names)) > len(names):
+        return _in_time_order(stamps, names, "file_names")
     raise InputError(
         f"no time for {names[0]}: expected a CSV file image_name,timestamp_s, or EXIF DateTimeOriginal in the photos, "
         "or file names that are times (like 1403715273262142976.png), or a fixed rate of the photos (--image_rate_hz)",
@@ -196,36 +196,28 @@ def read_image_times_csv(
     return replace(ordered, notes=(*notes, *ordered.notes), assumed=rows.notes)
 
 
-def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:
-    """Read times from EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
+def _stamps_by_exif(folder: Path, names: Sequence[str]) -> dict[str, _Stamp]:
+    """Return times by EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
 
     The times are seconds since 1970 in UTC. Photos without a zone take the zone of a photo that has one. If none has,
     UTC is assumed, which shifts all times alike.
-
-    Raises:
-        InputError: at most half of the photos have a time.
     """
     exifs = {
-        name: {tag: text.strip("\0 ") for tag, text in exif_tags(Path(folder) / name).items() if isinstance(text, str)}
+        name: {tag: text.strip("\0 ") for tag, text in exif_tags(folder / name).items() if isinstance(text, str)}
         for name in names
     }
     offsets = [_utc_offset(exif) for exif in exifs.values()]
     offset = next((known for known in offsets if known is not None), timedelta(0))
-    stamps = {name: stamp for name, exif in exifs.items() if (stamp := _exif_stamp(exif, offset)) is not None}
-    return _of_most(stamps, names, "exif", "EXIF DateTimeOriginal", Path(folder))
+    return {name: stamp for name, exif in exifs.items() if (stamp := _exif_stamp(exif, offset)) is not None}
 
 
-def times_from_file_names(names: Sequence[str]) -> ImageTimes:
-    """Read times from names that end in a time: ``1403715273262142976.png``, ``cam0/1305032180.405639.jpg``.
+def _stamps_by_names(names: Sequence[str]) -> dict[str, _Stamp]:
+    """Return times by names that end in one: ``1403715273262142976.png``, ``cam0/1305032180.405639.jpg``.
 
     A whole number is a time if, in s, ms, us or ns since 1970, it lies between 2001 and 2096. Smaller numbers are taken
     for frame numbers, which do not give a time. A number with three or more decimals is in seconds from any origin.
-
-    Raises:
-        InputError: at most half of the names are times.
     """
-    stamps = {name: stamp for name in names if (stamp := _name_stamp(name)) is not None}
-    return _of_most(stamps, names, "file_names", "time in its name", None)
+    return {name: stamp for name in names if (stamp := _name_stamp(name)) is not None}
 
 
 def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: str) -> ImageTimes:
@@ -266,19 +258,6 @@ def _refuse_repetitions(
         if first != row and frame_of.get(name, name) != frame_of.get(image_names[first], image_names[first]):
             message = f"{name} has the same time as {image_names[first]} in line {table.line[first]}, expected another"
             raise InputError(message, table.path, int(table.line[row]))
-
-
-def _of_most(
-    stamps: Mapping[str, _Stamp], names: Sequence[str], source: str, what: str, folder: Path | None
-) -> ImageTimes:
-    if 2 * len(stamps) <= len(names):
-        first = next(name for name in names if name not in stamps)
-        raise InputError(
-            f"{len(names) - len(stamps)} of {len(names)} photos have no {what}, the first is {first}; "
-            "expected a CSV file image_name,timestamp_s",
-            folder,
-        )
-    return _in_time_order(stamps, names, source)
 
 
 def _resolution(text: str) -> float:
