@@ -64,7 +64,7 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     linear, noise = problem.among(problem.is_used)
     by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
     column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))
-    heard = [name for what, name in rest.added.blocks if what == "anchor" and name in column_of]
+    heard = [name for what, name in rest.blocks if what == "anchor" and name in column_of]
     parts = [
         *photos.parts(rest.refined_params),
         *(PartSteps("anchor", id_, None, np.eye(3), np.ones(3)) for id_ in heard),

@@ -124,14 +124,15 @@ class MapProblem:
             left_out_ids=self.left_out_ids - set(self.marker_ids.values()),
         )
 
-    def add_to(self, adjustment: BundleAdjustment, start: Mapping[Block, Array]) -> AddedMeasurements:
-        """Add all measurements and the priors of calibrated cameras, with their blocks at start values."""
+    def add_to(self, adjustment: BundleAdjustment, start: Mapping[Block, Array]) -> dict[Block, Array]:
+        """Add all measurements and priors of calibrated cameras, and return their blocks, at first at these values."""
         problem = adjustment.adjuster.problem
         poses = [pose_of(self.metric.frame(int(frame_id))).params for frame_id in self.timed_ids]
         marks = {("mark", name): self.metric.point3D(id_).xyz for name, id_ in self.marker_ids.items()}
         own = {name: np.array(at, dtype=np.float64) for name, at in start.items() if name[0] != "mark"}
         blocks: dict[Block, Array] = {**own, **marks}
-        rows = tuple(kind.add_to(adjustment, poses, blocks) for kind in self.kinds)
+        for kind in self.kinds:
+            kind.add_to(adjustment, poses, blocks)
         fixed = frozenset[Block]().union(*(kind.fixed for kind in self.kinds))
         for name, block in blocks.items():
             if not problem.has_parameter_block(block):
@@ -141,7 +142,12 @@ class MapProblem:
             else:
                 adjustment.keep_from_elimination(block)
         add_calibration(adjustment, self.camera)
-        return AddedMeasurements(blocks, rows)
+        return blocks
+
+    def state(self, blocks: Mapping[Block, Array]) -> MapState:
+        """Return the poses and the values of these parameter blocks as they are."""
+        poses = model_poses(self.metric, [int(frame_id) for frame_id in self.frame_ids])
+        return MapState(poses, {name: block.copy() for name, block in blocks.items()})
 
 
 def map_problem(
@@ -177,43 +183,15 @@ def map_problem(
     )
 
 
-@dataclass(frozen=True)
-class AddedMeasurements:
-    """Measurements in a bundle adjustment.
-
-    Attributes:
-        blocks: parameter blocks by name, which the solver changes in place.
-        rows: for each kind the indices of its residuals among those of the problem.
-    """
-
-    blocks: Mapping[Block, Array]
-    rows: tuple[Indices, ...]
-
-    def state(self, metric: pycolmap.Reconstruction, frame_ids: Sequence[int] | Indices) -> MapState:
-        """Return the values that the solver has found."""
-        return MapState(
-            model_poses(metric, [int(frame_id) for frame_id in frame_ids]),
-            {name: block.copy() for name, block in self.blocks.items()},
-        )
-
-    def of_kind(self, what: str) -> list[Array]:
-        """Return the blocks whose names begin with ``what``."""
-        return [block for name, block in self.blocks.items() if name[0] == what]
-
-    @property
-    def others(self) -> list[Array]:
-        """Return the blocks that are no points of the world."""
-        return [block for name, block in self.blocks.items() if name[0] not in ("anchor", "mark")]
-
-    def equations(self, adjustment: BundleAdjustment) -> NormalEquations:
-        """Return the normal equations of the bundle adjustment at its present state."""
-        return NormalEquations.of(
-            adjustment.adjuster.problem,
-            adjustment.metric,
-            adjustment.num_reprojections,
-            self.of_kind("anchor"),
-            self.others,
-        )
+def equations_of(adjustment: BundleAdjustment, blocks: Mapping[Block, Array]) -> NormalEquations:
+    """Return the normal equations of a bundle adjustment with parameter blocks of measurements, at its state."""
+    return NormalEquations.of(
+        adjustment.adjuster.problem,
+        adjustment.metric,
+        adjustment.num_reprojections,
+        [block for (what, _), block in blocks.items() if what == "anchor"],
+        [block for (what, _), block in blocks.items() if what not in ("anchor", "mark")],
+    )
 
 
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:

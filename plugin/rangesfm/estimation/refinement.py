@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Indices
+from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.drift import SAME_NOISE, Straightened, close_in_graph, straighten, straighten_again
-from rangesfm.estimation.map_problem import AddedMeasurements, MapProblem
+from rangesfm.estimation.map_problem import MapProblem, equations_of
 from rangesfm.estimation.vision_information import (
     LoopPoses,
     Observations,
@@ -48,7 +48,7 @@ class MapAtRest:
 
     Attributes:
         problem: with the noise of the measurements at the end.
-        state: of the map. added: its blocks, to which the equations refer.
+        state: of the map. blocks: its parameter blocks, to which the equations refer.
         equations: of photos and all measurements; None if the photos are too many.
         refined_params: which parameters of each camera are adjusted, by its id.
         firm_ids: of the frames that the photos hold together, which are the map as a whole.
@@ -61,7 +61,7 @@ class MapAtRest:
 
     problem: MapProblem
     state: MapState
-    added: AddedMeasurements
+    blocks: Mapping[Block, Array]
     equations: NormalEquations | None
     refined_params: dict[int, list[int]]
     firm_ids: Indices
@@ -146,7 +146,7 @@ def refine_with_loops(
         marked, adjustment, _ = _without_misplaced(marked)
         added = marked.add_to(adjustment, closed.blocks)
         solve_bundle_adjustment(adjustment, marked.visible_m)
-        blocks = added.state(problem.metric, problem.frame_ids).blocks
+        blocks = problem.state(added).blocks
     merge_tracks(problem.metric)
     return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)))
 
@@ -170,7 +170,7 @@ def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
         added = problem.add_to(adjustment, blocks)
         solutions.append(solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * problem.smallest_stddev))
         num_left -= solutions[-1].num_iterations
-        state = added.state(problem.metric, problem.frame_ids)
+        state = problem.state(added)
         blocks = dict(state.blocks)
         seen = problem.with_noise_of(state, start.num_absorbed)
         if problem.change(seen) < SAME_NOISE or not solutions[-1].converged or num_left <= 0:
@@ -181,9 +181,9 @@ def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
     more, is_still = solve_until_still(adjustment, solutions[-1], tolerance_m, num_left)
     return MapAtRest(
         problem=problem,
-        state=added.state(problem.metric, problem.frame_ids),
-        added=added,
-        equations=added.equations(adjustment) if adjustment.has_covariance else None,
+        state=problem.state(added),
+        blocks=added,
+        equations=equations_of(adjustment, added) if adjustment.has_covariance else None,
         refined_params=adjustment.refined_params,
         firm_ids=frames_of_largest_part(problem.metric),
         pixel_stddev=adjustment.pixel_stddev,
@@ -207,7 +207,7 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors | None:
     try:
         return joint_covariance(
             rest.equations,
-            anchors={name: block for (what, name), block in rest.added.blocks.items() if what == "anchor"},
+            anchors={name: block for (what, name), block in rest.blocks.items() if what == "anchor"},
             residual_stddev=bending_factor * rest.pixel_stddev,
             refined_params=rest.refined_params,
             firm_frame_ids=rest.firm_ids,

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from rangesfm import solver
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.kind import LEAST_SQUARES, Block, Linearization, MapState, Measurements, Weights
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
@@ -35,12 +35,10 @@ class UpwardDirection(Measurements):
         residual = stddev * self.gravity.residuals(rotation)
         return Linearization(residual[None], np.zeros((1, 1), dtype=np.int64), by_pose, ())
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first = adjustment.adjuster.problem.num_residuals()
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         cost = solver.direction_cost(
             direction_in_world=UP_IN_SITE,
             direction_in_cam=self.gravity.up_in_first_camera,
             stddev_rad=self.gravity.stddev_rad / adjustment.pixel_stddev,
         )
         solver.add_residual_block(adjustment.adjuster, cost, None, [poses[0]])
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())

@@ -122,14 +122,11 @@ class Measurements(ABC):
         """Return residuals and derivatives at a state."""
 
     @abstractmethod
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         """Add their costs to a bundle adjustment, in pixels.
 
         Args:
             poses: rig_from_world (7,) of each keyframe. blocks: parameter blocks by name.
-
-        Returns:
-            Index of each residual among those of the problem, in the order of the measurements.
         """
 
     @property

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from rangesfm import solver
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.kind import LEAST_SQUARES, Block, ByBlock, Linearization, MapState, Measurements, Weights
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 
@@ -47,20 +47,18 @@ class Prior(Measurements):
         )
         return Linearization.without_poses(off.reshape(1, -1), by_block)
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         """Add the prior, if the problem has its blocks.
 
         Raises:
             ValueError: the problem has some of the blocks only.
         """
-        first, problem = adjustment.adjuster.problem.num_residuals(), adjustment.adjuster.problem
-        own = [blocks[name] for name in self.names]
+        problem, own = adjustment.adjuster.problem, [blocks[name] for name in self.names]
         are_there = [problem.has_parameter_block(block) for block in own]
         if not any(are_there):
-            return np.zeros(0, dtype=np.int64)
+            return
         if not all(are_there):
             missing = [name for name, is_there in zip(self.names, are_there, strict=True) if not is_there]
             raise ValueError(f"a joint prior of {self.names}, but nothing else depends on {missing}")
         cost = solver.joint_prior_cost(mean=self.mean, whitening=adjustment.pixel_stddev * self.root_information)
         solver.add_residual_block(adjustment.adjuster, cost, None, own)
-        return np.arange(first, problem.num_residuals())

@@ -127,8 +127,8 @@ class InertialMotions(Measurements):
         )
         return Linearization(found.residual, np.column_stack([at.before, at.after]), found.by_pose, by_block)
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first, at, roots = adjustment.adjuster.problem.num_residuals(), self.intervals, self._root_information
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
+        at, roots = self.intervals, self._root_information
         for k, (before, after) in enumerate(zip(at.before.tolist(), at.after.tolist(), strict=True)):
             cost = solver.inertial_cost(
                 interval_s=at.interval_s[k],
@@ -148,7 +148,6 @@ class InertialMotions(Measurements):
             solver.add_residual_block(
                 adjustment.adjuster, cost, None, [poses[before], poses[after], *velocities, *further]
             )
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())
 
     def at_blocks(self, blocks: Mapping[Block, Array]) -> InertialMotions:
         return replace(self, start={name: blocks[name] for name in self.start})
@@ -195,14 +194,12 @@ class BiasWalk(Measurements):
         by_block = (ByBlock(self.names, rows, -one), ByBlock(self.names, rows + 1, one))
         return Linearization.without_poses(changes, by_block)
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first = adjustment.adjuster.problem.num_residuals()
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         for k, root in enumerate(self.weights.root_information):
             cost = solver.joint_prior_cost(
                 mean=np.zeros((2, 6)), whitening=adjustment.pixel_stddev * np.hstack([-root, root])
             )
             solver.add_residual_block(adjustment.adjuster, cost, None, [blocks[name] for name in self.names[k : k + 2]])
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())
 
 
 @dataclass(frozen=True)
@@ -220,13 +217,12 @@ class GravityLength(Measurements):
         by_block = ByBlock((GRAVITY,), np.zeros(1, dtype=np.int64), down[None, None])
         return Linearization.without_poses(np.array([[length - GRAVITY_M_S2]]), (by_block,))
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         """Add the cost along the present direction, which turns by little in a bundle adjustment."""
-        first, (_, down) = adjustment.adjuster.problem.num_residuals(), _length_and_direction(blocks[GRAVITY])
+        _, down = _length_and_direction(blocks[GRAVITY])
         root = adjustment.pixel_stddev * self.weights.root_information[0] * down
         cost = solver.joint_prior_cost(mean=GRAVITY_M_S2 * down[None], whitening=root)
         solver.add_residual_block(adjustment.adjuster, cost, None, [blocks[GRAVITY]])
-        return np.array([first])
 
 
 def _length_and_direction(vector: Array) -> tuple[float, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm import solver
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.kind import (
     LEAST_SQUARES,
     Block,
@@ -100,8 +100,7 @@ class Lengths(Measurements):
     def with_errors_of_marks(self, beyond_m2: Mapping[str, Array]) -> Self:
         return replace(self, beyond_m2=beyond_m2)
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first = adjustment.adjuster.problem.num_residuals()
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         images = images_by_name(adjustment.metric)
         for row, names in enumerate(self.ends):
             if self._is_in_rig(names):
@@ -120,7 +119,6 @@ class Lengths(Measurements):
             )
             bias = [blocks[BETWEEN_ANCHORS]] if self.bias_stddev_m > 0 else []
             solver.add_residual_block(adjustment.adjuster, cost, None, [start.block, end.block, *bias])
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())
 
     def _is_in_rig(self, names: tuple[str, str]) -> bool:
         """Return whether both ends are cameras of one rig at one time, whose length is that of the rig."""

@@ -147,11 +147,10 @@ class AntennaPositions(Measurements):
             by_block,
         )
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first, at, roots = adjustment.adjuster.problem.num_residuals(), self.places, self._root_information
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
+        at, roots = self.places, self._root_information
         arm_is_free, clock_is_free = self.arm_stddev_m > 0, self.clock_stddev_s > 0
-        groups = rows_by_key(at.before, at.after)
-        for rows in groups:
+        for rows in rows_by_key(at.before, at.after):
             ends = list(dict.fromkeys((int(at.before[rows[0]]), int(at.after[rows[0]]))))
             is_between = len(ends) == 2
             cost = solver.position_cost(
@@ -167,8 +166,6 @@ class AntennaPositions(Measurements):
             further = [blocks[ARM]] if arm_is_free else []
             further += [blocks[CLOCK]] if is_between and clock_is_free else []
             solver.add_residual_block(adjustment.adjuster, cost, None, [*(poses[end] for end in ends), *further])
-        coordinates = (3 * np.concatenate(groups)[:, None] + np.arange(3)).ravel()
-        return np.asarray(first + np.argsort(coordinates))
 
     def like(self, other: AntennaPositions) -> AntennaPositions:
         return replace(self, factor=other.factor, inflation=other.inflation)
@@ -249,10 +246,8 @@ class MarkedPositions(Measurements):
     def with_errors_of_marks(self, beyond_m2: Mapping[str, Array]) -> Self:
         return replace(self, beyond_m2=beyond_m2)
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        first = adjustment.adjuster.problem.num_residuals()
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         for row, name in enumerate(self.names):
             further = self.beyond_m2.get(name, np.zeros((3, 3))) / adjustment.pixel_stddev**2
             stddev = self.stddev_m[row] / adjustment.pixel_stddev
             solver.add_normal_prior(adjustment.adjuster, blocks["mark", name], self.position_m[row], stddev, further)
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())

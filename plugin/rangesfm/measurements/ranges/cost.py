@@ -216,7 +216,7 @@ class Ranges(Measurements):
     def _later_s(self, state: MapState) -> float:
         return float(state.blocks[CLOCK][0]) if CLOCK in state.blocks else 0.0
 
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
         log, rows, at = self.observations.log, self.rows, self.places.subset(self.rows)
         placed = solver.PlacedRanges(
             range_m=log.range_m[rows],
@@ -242,7 +242,7 @@ class Ranges(Measurements):
             amplitude=blocks.get(SHORT),
             shared=[blocks[name] for name, _, _ in self._shared],
         )
-        return solver.add_ranges(
+        solver.add_ranges(
             adjustment.adjuster,
             placed,
             own,
