@@ -15,7 +15,7 @@ import numpy as np
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
 from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.lengths.tape_file import read_tape
+from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, read_error_curve
@@ -202,7 +202,7 @@ TARGETS: tuple[Target, ...] = (
     Target("reference", "reference.csv", read_reference, _check_reference),
     Target("tum", "reference.tum", read_reference, _check_reference),
     Target("distances", "distances.csv", read_tape, _check_tape),
-    Target("markers", "markers.csv", lambda path: read_tape(CORPUS / "distances" / "plain.csv", path), _check_tape),
+    Target("markers", "markers.csv", lambda path: Tape(markers=read_markers(path)), _check_tape),
     Target("error_curve", "curve.csv", read_error_curve, _check_curve),
     Target("survey", "survey.toml", read_survey, _check_survey),
     Target("result_json", "result.json", _read_whole_result, _accept_all),

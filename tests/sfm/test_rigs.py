@@ -163,7 +163,7 @@ def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_anoth
     taped = read_rigs(tmp_path / "rig_config.json").baselines(model, stddev_m)
     assert len(taped) == num_measured
     path = trajectory_from_reconstruction(model)
-    located = locate_distances(Tape(taped), model, [], path)
+    located = locate_distances(Tape(taped), model, [])
     found = known_scale(lengths_between_points(located, path, WalkBending(in_first_camera(path)))).alone
     assert found.scale.value == pytest.approx(1.0, rel=1e-3)
     expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.measurements.lengths.map_points import MapPoints
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.pipeline.measured_map import MeasuredMap, Measurement
+from rangesfm.pipeline.measure import Measurement, measured
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.util.geometry.gravity import UP_IN_SITE
 
@@ -121,12 +121,14 @@ def pairs_of(names: dict[str, list[str]], true_m: dict[str, Array], rng: np.rand
                 yield [what, str(a), str(b)]
 
 
-def measured_map(metric: MetricResult, markers: dict[str, Marker]) -> MeasuredMap:
+def measured_in(
+    metric: MetricResult, markers: dict[str, Marker], pairs: Iterable[tuple[str, str]]
+) -> tuple[Measurement, ...]:
     assert metric.kept is not None
     anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
     points = MapPoints(metric.final, anchors_m, markers, metric.kept.summary.pixel_stddev)
     up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
-    return MeasuredMap(points, metric.map_errors, metric.estimate.uncertainty.empirical, up)
+    return measured(points, pairs, metric.map_errors, metric.estimate.uncertainty.empirical, up)
 
 
 def told(name: str, seed: int) -> Line:
@@ -149,7 +151,7 @@ def told(name: str, seed: int) -> Line:
     true_m |= dict(zip(model.timestamps_s, model.centers_m, strict=True)) | truth.anchors_m
     true_m |= {name: model.reconstruction.point3D(int(name[6:])).xyz for name in names["points"]}
     pairs = [*pairs_of(names, true_m, rng)]
-    found = measured_map(metric, markers).measure((a, b) for _, a, b in pairs)
+    found = measured_in(metric, markers, ((a, b) for _, a, b in pairs))
     rows = [_row(what, each, true_m) for (what, _, _), each in zip(pairs, found, strict=True)]
     return {**line, "refused": "", "verdict": metric.estimate.verdict, "rows": rows}
 

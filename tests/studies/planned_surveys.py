@@ -188,7 +188,7 @@ def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances
     lengths, stddevs = np.array(planned.taped, dtype=np.float64).reshape(-1, 2).T
     found = lengths + stddevs * rng.standard_normal(len(lengths))
     bent = lengths * (1 + BENDING * rng.standard_normal(len(lengths)))
-    return LocatedDistances.control(found, stddevs, model_length=bent / METRES_PER_UNIT)
+    return LocatedDistances.between_points(found, stddevs, bent / METRES_PER_UNIT)
 
 
 def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> Row:

@@ -192,7 +192,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
     from rangesfm.measurements.lengths.tape import Tape
-    from rangesfm.measurements.lengths.tape_file import read_tape
+    from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
     from rangesfm.measurements.positions.true_positions import read_true_positions
     from rangesfm.pipeline.ranges_for_models import ranges_of_survey
 
@@ -208,7 +208,9 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
         model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model.num_images())
         ranges = ranges_of_survey(survey, model, path)
     if survey.scale.distances is not None:
-        tape = read_tape(survey.scale.distances, survey.scale.markers)
+        tape = read_tape(survey.scale.distances)
+        if survey.scale.markers is not None:
+            tape = tape.with_more_markers(read_markers(survey.scale.markers))
     reference = None if args.reference is None else read_true_positions(args.reference)
     comparison = compare_many(models, ranges, tape, reference)
     lines = [str(comparison)]

@@ -50,7 +50,10 @@ def export_result(
     check_formats(options.formats)
     result, folder = read_result_folder(Path(output_path)), Path(destination)
     with sole_writer(folder):
-        return export_map(_read_map(result, None if images_path is None else Path(images_path)), folder, options)
+        map_ = _read_map(result)
+        if images_path is not None:
+            map_ = replace(map_, images_path=Path(images_path))
+        return export_map(map_, folder, options)
 
 
 def apply_result(
@@ -73,7 +76,7 @@ def apply_result(
     """
     paths = list(paths)
     result = read_result_folder(output_path)
-    map_ = _read_map(result, None)
+    map_ = _read_map(result)
     notes = list[str]()
     sfm = result.read_model("sparse")
     if result.read_model("sparse_metric") is not None and sfm is not None:
@@ -107,7 +110,7 @@ def _in_other_frames(map_: MetricMap, options: ExportOptions) -> Iterator[Metric
             yield in_frame(map_, options.changed(frame=frame))
 
 
-def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
+def _read_map(result: ResultFolder) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
@@ -118,7 +121,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         anchors_m=result.anchor_positions_m,
         metric_from_sfm=summary.metric_from_sfm.similarity,
         relative_scale_stddev=summary.scale.relative_stddev_empirical,
-        images_path=images_path or result.images_path,
+        images_path=result.images_path,
         database_path=result.path / DATABASE_NAME,
         is_site=summary.frame == "site",
         upward=None if summary.up is None else summary.up[0],

@@ -193,7 +193,7 @@ def _tied(
     run: SurveyRun, paths: Sequence[PathOfModel], verified: Mapping[Pair, Indices]
 ) -> tuple[list[PathOfModel], set[Pair]]:
     """Return the models, of which those that photos tie are one, and the pairs that tie them; each tie is told."""
-    parts, pairs, contradicted = list(paths), set[Pair](), dict[str, None]()
+    parts, pairs, contradicted = list(paths), set[Pair](), list[str]()
     while (found := _next_tie(run, parts, verified, contradicted)) is not None:
         first, second, tie = found
         one, other = parts[first], parts[second]
@@ -209,7 +209,7 @@ def _tied(
 
 
 def _next_tie(
-    run: SurveyRun, parts: Sequence[PathOfModel], verified: Mapping[Pair, Indices], contradicted: dict[str, None]
+    run: SurveyRun, parts: Sequence[PathOfModel], verified: Mapping[Pair, Indices], contradicted: list[str]
 ) -> tuple[int, int, Tie] | None:
     """Return a tie of two models that the ranges allow, with their indices; note the others in ``contradicted``."""
     for first, second in combinations(range(len(parts)), 2):
@@ -219,7 +219,8 @@ def _next_tie(
             continue
         if not (why := _contradiction(run, one, other, tie)):
             return first, second, tie
-        contradicted[f"{other.name} looks like a part of {one.name}, but is none: {why}"] = None
+        if (told := f"{other.name} looks like a part of {one.name}, but is none: {why}") not in contradicted:
+            contradicted.append(told)
     return None
 
 

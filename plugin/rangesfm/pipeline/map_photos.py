@@ -94,12 +94,14 @@ def with_keyframes(run: SurveyRun) -> tuple[SurveyRun, tuple[str, ...]]:
         InputError: they do not.
     """
     run = run.with_photos(photos := list_images(run.survey.photos_path), "the folder")
-    keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=not run.inputs.needs_times)
+    keyframes, times = find_keyframes(
+        run.survey, run.journal, needs_times=run.inputs.needs_times, keeps_all=not run.inputs.needs_times
+    )
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
     check_times(run, nowhere)
     check_taped_ends(run, keyframes if run.survey.images.rig_config is None else photos)
-    return with_times(run, times), keyframes
+    return run if times is None else with_times(run, times), keyframes
 
 
 def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
@@ -108,13 +110,13 @@ def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
     check_ends(run.inputs.tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
 
 
-def with_times(run: SurveyRun, times: ImageTimes | None) -> SurveyRun:
+def with_times(run: SurveyRun, times: ImageTimes) -> SurveyRun:
     """Return the survey with the times of its photos, after warnings of their oddities.
 
     The warnings are of both clocks if no time offset is given.
     """
     radio_s, options = run.inputs.log.timestamp_s, run.survey.ranges
-    if times is not None and radio_s is not None:
+    if radio_s is not None:
         run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
         at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
         run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
@@ -167,7 +169,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
 
 
 def find_keyframes(
-    survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
+    survey: Survey, journal: Journal, *, needs_times: bool = False, keeps_all: bool = False
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
     """Return the keyframes and their times; None in place of times, and order by name, where times are not needed.
 
@@ -176,8 +178,8 @@ def find_keyframes(
     Args:
         survey: options.
         journal: for warnings about times.
-        log_names_photos: whether the log names photos in place of times; then photos without a time are kept. None:
-            there is no log.
+        needs_times: whether times are needed. keeps_all: whether photos without a time are kept, unless the survey
+            gives times.
 
     Raises:
         InputError: times are needed and cannot be found.
@@ -187,7 +189,7 @@ def find_keyframes(
         frames = read_rigs(survey.images.rig_config).frames(list_images(folder))
         names = tuple(frames)
         image_times = None
-        with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
+        with nullcontext() if survey.images.times or needs_times else suppress(InputError):
             image_times = find_image_times(
                 folder,
                 names,
@@ -197,7 +199,7 @@ def find_keyframes(
                 columns=survey.images.times_columns,
                 unit=survey.images.times_unit,
             )
-        if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
+        if image_times is None or (keeps_all and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
         journal.note(*image_times.assumed)

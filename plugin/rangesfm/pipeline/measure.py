@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
-from rangesfm.measurements.lengths.map_points import MapPoints
+from rangesfm.measurements.lengths.map_points import MapPoint, MapPoints
 from rangesfm.measurements.lengths.measured_lists import PAIRS
 from rangesfm.measurements.lengths.tape import FOUND_STDDEV_PX, Marker
 from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_markers
-from rangesfm.pipeline.measured_map import Interval, MeasuredMap, Measurement
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import align_rows, write_table
+from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 _MEASURES = ("distance", "height_difference")
@@ -31,6 +34,28 @@ _NO_HEIGHTS = (
     "no height differences: the map is in the first camera's frame, and its upward direction is unknown (surveyed "
     "anchors, an inertial sensor or [scale] up_in_first_camera give it)"
 )
+
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The distance of two points of a map, and how much higher the second one is.
+
+    Attributes:
+        ends: names of both points.
+        distance_m: length of the straight line between them.
+        distance_interval_m: 95 % interval of the distance.
+        height_difference_m: height of the second minus height of the first; None if the map does not know what is up.
+        height_interval_m: its 95 % interval; None without a height difference or without a joint covariance.
+    """
+
+    ends: tuple[str, str]
+    distance_m: float
+    distance_interval_m: Interval
+    height_difference_m: float | None
+    height_interval_m: Interval | None
 
 
 @dataclass(frozen=True)
@@ -86,13 +111,59 @@ def measure(
     if result.summary.scale.interval_95 is None:
         said = f"the scale has no interval ({result.summary.scale.method})"
         raise InputError(f"{said}, so that no length in the map has one", result.path)
-    map_ = MeasuredMap(
-        _points_of(result, None if markers is None else Path(markers)),
-        result.read_map_errors(),
-        result.summary.scale.relative_stddev_empirical,
-        result.summary.up,
-    )
-    return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))
+    points = _points_of(result, {} if markers is None else read_markers(markers))
+    errors, up, stddev = result.read_map_errors(), result.summary.up, result.summary.scale.relative_stddev_empirical
+    notes = [] if errors is not None else [_SCALE_ALONE]
+    notes += [] if up is not None else [_NO_HEIGHTS]
+    for what, verdict in (("scale", result.summary.scale), ("place", result.summary.place)):
+        if verdict is not None and verdict.verdict != "good":
+            notes.append(f"the {what} of the map is doubtful, and so are these intervals: {'; '.join(verdict.reasons)}")
+    return Measurements(measured(points, pairs, errors, stddev, up), tuple(notes))
+
+
+def measured(
+    points: MapPoints,
+    pairs: Iterable[tuple[str, str]],
+    errors: MapErrors | None,
+    relative_scale_stddev: float,
+    up: tuple[Array, float] | None,
+) -> tuple[Measurement, ...]:
+    """Measure between points of a map by name.
+
+    Args:
+        errors: how its parts err together; None if that is not known. Then intervals come from the scale alone.
+        relative_scale_stddev: standard deviation of its scale, divided by the scale, as it is stated.
+        up: upward unit vector (3,) in the map and the standard deviation of its direction in radians; None if unknown.
+
+    Raises:
+        InputError: a name is not in the map.
+    """
+    pairs = list(pairs)
+    found = {name: points.find(name) for name in dict.fromkeys(name for pair in pairs for name in pair)}
+
+    def between(first: MapPoint, second: MapPoint) -> Measurement:
+        apart = second.position_m - first.position_m
+        distance_m = float(np.linalg.norm(apart))
+        if errors is None:
+            covariance = relative_scale_stddev**2 * np.outer(apart, apart)
+        else:
+            covariance = errors.relative(first.errors, second.errors, relative_scale_stddev)
+
+        def interval(value: float, along: Array, more_stddev: float = 0.0) -> Interval:
+            half = NORMAL_95 * math.sqrt(max(float(along @ covariance @ along), 0.0) + more_stddev**2)
+            return value - half, value + half
+
+        low, high = interval(distance_m, apart / distance_m if distance_m > 0 else np.zeros(3))
+        height = of_height = None
+        if up is not None:
+            upward, tilt_stddev = up
+            height = float(upward @ apart)
+            if errors is not None:
+                level_m = float(np.linalg.norm(apart - height * upward))
+                of_height = interval(height, upward, tilt_stddev * level_m)
+        return Measurement((first.name, second.name), distance_m, (max(low, 0.0), high), height, of_height)
+
+    return tuple(between(found[first], found[second]) for first, second in pairs)
 
 
 def read_point_pairs(path: Path) -> list[tuple[str, str]]:
@@ -112,36 +183,21 @@ def read_point_pairs(path: Path) -> list[tuple[str, str]]:
     return pairs
 
 
-def _points_of(result: ResultFolder, markers_path: Path | None) -> MapPoints:
+def _points_of(result: ResultFolder, more_markers: Mapping[str, Marker]) -> MapPoints:
+    """Return the points of a result: with corners of printed tags that it found, and markers that its survey gave."""
     model = result.read_metric_model()
     if model is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to measure in", result.path)
-    refine = result.summary.refine
-    pixel_stddev = None if refine is None else refine.pixel_stddev
-    markers = _markers_of(result) | ({} if markers_path is None else read_markers(markers_path))
-    markers = markers_of_photos(markers, [image.name for image in model.images.values()])
-    anchors_m = result.anchor_positions_m
-    return MapPoints(model, anchors_m, markers, np.nan if pixel_stddev is None else pixel_stddev)
-
-
-def _markers_of(result: ResultFolder) -> dict[str, Marker]:
-    """Return the corners of printed tags that the run found, and the markers that its survey gave."""
     found: dict[str, Marker] = {}
     if (result.path / TagCorners.NAME).is_file():
         found |= read_markers(result.path / TagCorners.NAME, FOUND_STDDEV_PX)
     recorded = result.summary.settings.to_json().get("scale", {}).get("markers")
     given = None if recorded is None else input_beside(result.path, recorded)
-    return found | (read_markers(given) if given is not None and given.is_file() else {})
-
-
-def _notes(result: ResultFolder, map_: MeasuredMap) -> Iterator[str]:
-    if map_.errors is None:
-        yield _SCALE_ALONE
-    if map_.up is None:
-        yield _NO_HEIGHTS
-    for what, verdict in (("scale", result.summary.scale), ("place", result.summary.place)):
-        if verdict is not None and verdict.verdict != "good":
-            yield f"the {what} of the map is doubtful, and so are these intervals: {'; '.join(verdict.reasons)}"
+    found |= read_markers(given) if given is not None and given.is_file() else {}
+    markers = markers_of_photos({**found, **more_markers}, [image.name for image in model.images.values()])
+    refine = result.summary.refine
+    pixel_stddev = None if refine is None else refine.pixel_stddev
+    return MapPoints(model, result.anchor_positions_m, markers, np.nan if pixel_stddev is None else pixel_stddev)
 
 
 def _interval(ends: Interval, sign: str = "") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pycolmap
 
 from rangesfm.comparison.model_ranges import ModelRanges
 from rangesfm.measurements.ranges.range_observations import USED
-from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import map_of_model
 from rangesfm.progress import SILENT, Journal
 from rangesfm.survey.inputs import read_ranging_inputs
@@ -37,28 +35,18 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
     survey = survey.changed({"images.model": model_path.absolute()})
     run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
     times = None if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
-    return _ranges_of_map(*map_of_model(run, model, refine=False), times)
-
-
-def _ranges_of_map(run: SurveyRun, metric: MetricResult, image_times_s: Mapping[str, float] | None) -> ModelRanges:
-    """Return the ranges that a map in metres uses, and its anchors.
-
-    Args:
-        run: survey of the map.
-        metric: the map, scaled by its ranges.
-        image_times_s: as in ``ModelRanges``.
-    """
-    estimate, log, inputs = metric.estimate, metric.observations.log, run.inputs
+    run, metric = map_of_model(run, model, refine=False)
+    log, inputs = metric.observations.log, run.inputs
     if log.timestamp_s is not None:
         log = replace(log, timestamp_s=log.timestamp_s + metric.path.offset_s)
     anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
-    scaled = estimate.metric_from_sfm
+    scaled = metric.estimate.metric_from_sfm
     return ModelRanges(
         log=log.subset(np.isin(metric.observations.status, USED)),
         tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
         anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
-        image_times_s=image_times_s,
+        image_times_s=times,
         metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation),
         association=run.survey.ranges,
     )

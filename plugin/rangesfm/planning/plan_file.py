@@ -268,7 +268,7 @@ def _points(points: PlannedPointOptions) -> tuple[ControlPoint, ...]:
     if points.path is None:
         places = enumerate(points.places.items())
         return tuple(ControlPoint(name, np.array(at), points.stddev_m, CONTROL, k) for k, (name, at) in places)
-    return read_control_points(PointOptions(path=points.path, stddev_m=points.stddev_m), None).points
+    return read_control_points(PointOptions(path=points.path, stddev_m=points.stddev_m)).points
 
 
 def _path(path: PlannedPathOptions) -> Trajectory:

@@ -208,7 +208,7 @@ class PlannedSurvey:
         lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
         # Between its ends the scale of the map varies.
         stddevs = np.hypot(stddevs, BENDING * lengths)
-        return LocatedDistances.control(lengths, stddevs, model_length=lengths)
+        return LocatedDistances.between_points(lengths, stddevs, lengths)
 
     def posed(
         self,

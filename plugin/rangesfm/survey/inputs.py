@@ -12,7 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
 from rangesfm.measurements.lengths.tape import Marker, Tape
-from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_tape
+from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_markers, read_tape
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.known_positions import LASTING_S
@@ -120,7 +120,9 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     _check_anchors_known(log, anchors, survey)
     frame = survey.anchors.frame or default_anchor_frame(anchors)
     site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
-    site, positions = _surveyed_positions(survey, site, anchors, frame)
+    is_marked, marks = (survey.points.path or survey.scale.distances) is not None, survey.scale.markers
+    markers = read_markers(marks) if is_marked and marks is not None else {}
+    site, positions = _surveyed_positions(survey, site, anchors, frame, markers)
     is_placed = any(anchor.position_m is not None for anchor in anchors)
     if frame != "unknown" and not is_placed:
         raise InputError(
@@ -134,7 +136,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     curve_path, curve_notes = survey.ranges.error_curve, list[str]()
     if curve_path is not None:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
-    tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
+    tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances).with_more_markers(markers)
     reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
     imu = read_sensor(survey.imu)
     notes = (*_warnings(log, anchors, survey), *curve_notes, *(() if imu is None else imu.log.doubts))
@@ -177,14 +179,14 @@ def _read_radio(survey: Survey) -> tuple[RangeLog, tuple[Anchor, ...], tuple[str
 
 
 def _surveyed_positions(
-    survey: Survey, site: Site, anchors: Sequence[Anchor], frame: str
+    survey: Survey, site: Site, anchors: Sequence[Anchor], frame: str, markers: Mapping[str, Marker]
 ) -> tuple[Site, SurveyedPositions]:
     """Return the known positions in the site's local frame, and that frame, which is theirs where no anchor has one.
 
     Raises:
         InputError: a file is wrong, or only one of anchors and points has a coordinate system.
     """
-    points, asked = read_control_points(survey.points, survey.scale.markers), survey.positions
+    points, asked = read_control_points(survey.points), survey.positions
     folder = asked.path if asked.path is not None and asked.path.is_dir() else None
     log = read_positions(asked) if folder is None else read_exif_positions(folder)
     if not points.points and log is None:
@@ -202,6 +204,7 @@ def _surveyed_positions(
         return moved
 
     if points.points:
+        points = points.with_more(markers)
         points = points.moved_to(local(points.positions_m, survey.points.crs or points.crs, points.path))
     if log is None:
         return site, SurveyedPositions(points)

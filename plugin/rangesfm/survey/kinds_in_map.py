@@ -19,7 +19,12 @@ from rangesfm.measurements.kind import Block, Measurements
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances, surveyed_distances
+from rangesfm.measurements.lengths.locate_lengths import (
+    NO_DISTANCES,
+    lengths_by_pose,
+    locate_distances,
+    surveyed_distances,
+)
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
@@ -102,7 +107,8 @@ def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array])
 def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
     if not inputs.tape.distances:
         return None
-    found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path)
+    found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
+    found = replace(found, by_pose=lengths_by_pose(found, inputs.tape, at.model, at.path))
     if (before := find_kind(at.before, LengthScale)) is not None:
         return before.on_refined_map(found, at.path, at.bending, at.metres_per_unit)
     return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, inputs.tape.distances)

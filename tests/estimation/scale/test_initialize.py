@@ -384,7 +384,7 @@ def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.
     pairs = np.array([[0, len(survey.times) // 2], [len(survey.times) // 4, -1]])
     model = np.linalg.norm(np.diff(survey.trajectory.centers[pairs], axis=1)[:, 0], axis=1)
     metric = factor * np.linalg.norm(np.diff(survey.centers_m[pairs], axis=1)[:, 0], axis=1)
-    return LocatedDistances.control(metric, np.full(2, stddev_m), model_length=model)
+    return LocatedDistances.between_points(metric, np.full(2, stddev_m), model)
 
 
 def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances:
@@ -392,7 +392,7 @@ def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances
     places = np.array(list(survey.anchors_m.values()))
     pairs = np.array([[0, k] for k in range(1, len(places))])
     lengths = np.linalg.norm(places[1:] - places[0], axis=1)
-    return LocatedDistances.control(lengths, np.full(len(lengths), stddev_m), anchor_pair=pairs)
+    return LocatedDistances.between_anchors(lengths, np.full(len(lengths), stddev_m), pairs)
 
 
 def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:
@@ -510,9 +510,7 @@ def points_in_site(num: int, scale: float) -> KnownPositions:
 
 
 def taped(scale: float, stddev_m: float = 0.01) -> LocatedDistances:
-    return LocatedDistances.control(
-        scale * np.array([4.0, 5.0, 6.0]), np.full(3, stddev_m), model_length=np.arange(4.0, 7.0)
-    )
+    return LocatedDistances.between_points(scale * np.array([4.0, 5.0, 6.0]), np.full(3, stddev_m), np.arange(4.0, 7.0))
 
 
 def of_no_ranges(*kinds: KindOnMap) -> ScaleEstimate:

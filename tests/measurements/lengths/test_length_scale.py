@@ -69,7 +69,7 @@ def located(
     slopes = np.zeros((num, NUM, 6))
     slopes[np.arange(num), end, 3:] += away / model[:, None]
     slopes[np.arange(num), start, 3:] -= away / model[:, None]
-    found = LocatedDistances.control(metric, np.full(num, tape_m), model_length=model)
+    found = LocatedDistances.between_points(metric, np.full(num, tape_m), model)
     return replace(found, by_pose=csr_array(slopes.reshape(num, -1)))
 
 
@@ -171,7 +171,7 @@ def test_without_bending_lengths_weigh_by_tape_and_marks(rng: np.random.Generato
     """Errors of marks are errors of the model, which the scale makes metres."""
     path = walked(rng)
     model, mark_stddev = np.array([4.0, 4.0]), np.array([0.0, 0.1])
-    taped = LocatedDistances.control(np.array([2.0, 2.04]), np.full(2, 0.005), model_length=model)
+    taped = LocatedDistances.between_points(np.array([2.0, 2.04]), np.full(2, 0.005), model)
     found = scaled(replace(taped, mark_stddev=mark_stddev), path)
     own = 0.005**2 + (mark_stddev * found.alone.scale.value) ** 2
     assert found.alone.scale.value == pytest.approx(np.average([0.5, 0.51], weights=1 / own), rel=1e-5)
@@ -181,7 +181,7 @@ def test_without_bending_lengths_weigh_by_tape_and_marks(rng: np.random.Generato
 
 def test_a_length_is_tested_against_what_the_others_predict(rng: np.random.Generator) -> None:
     model, tape_m = np.array([4.0, 2.0, 6.0]), np.array([0.01, 0.02, 0.02])
-    taped = LocatedDistances.control(0.5 * model + np.array([0.0, 0.04, 0.0]), tape_m, model_length=model)
+    taped = LocatedDistances.between_points(0.5 * model + np.array([0.0, 0.04, 0.0]), tape_m, model)
     found = scaled(taped, walked(rng))
     weights = (model / tape_m)[[0, 2]] ** 2
     variance = model[1] ** 2 / weights.sum() + tape_m[1] ** 2
@@ -224,12 +224,9 @@ def test_a_length_depends_on_the_poses_of_its_ends(rng: np.random.Generator) -> 
 def test_beside_ranges_one_length_stands_for_all_between_points(rng: np.random.Generator) -> None:
     path = walked(rng)
     lengths = scaled(located(path, 2, rng), path)
-    taped = LocatedDistances.control(
-        np.array([2.0, 7.0, 3.0]),
-        np.array([0.1, 0.2, 0.3]),
-        model_length=np.array([4.0, np.nan, 6.0]),
-        anchor_pair=np.array([[-1, -1], [0, 1], [-1, -1]]),
-    )
+    lengths_m, stddevs_m = np.array([2.0, 7.0, 3.0]), np.array([0.1, 0.2, 0.3])
+    taped = LocatedDistances.between_points(lengths_m, stddevs_m, np.array([4.0, np.nan, 6.0]))
+    taped = replace(taped, anchor_pair=np.array([[-1, -1], [0, 1], [-1, -1]]))
     beside, alone = known(with_lengths(taped, [lengths])), lengths.alone.scale
     np.testing.assert_allclose(beside.distance_m, [alone.value, 7.0])
     np.testing.assert_allclose(beside.stddev_m, [alone.stddev, 0.2])

@@ -25,7 +25,7 @@ def test_what_a_length_could_do_unfound_is_what_the_scale_does_when_it_is_so_muc
         lengths = known(lengths_between_points(distances, path, WalkBending(path), taped=taped))
         return lengths.tested(lengths.start, ())
 
-    located = LocatedDistances.control(lengths_m, stddevs_m, model_length=lengths_m / 2)
+    located = LocatedDistances.between_points(lengths_m, stddevs_m, lengths_m / 2)
     taped = tuple(TapedDistance((f"{k}a", f"{k}b"), float(lengths_m[k]), 0.01, "control", k) for k in range(3))
     scale = by(located)
     found = {test.subject: test for test in scale.tests(scale.alone, {}).tests}

@@ -25,7 +25,7 @@ from tests.solver.test_covariance import (
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.map_points import MapPoints
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.pipeline.measured_map import MeasuredMap
+from rangesfm.pipeline.measure import measured
 from rangesfm.util.geometry.map_errors import Part
 
 Array = npt.NDArray[np.float64]
@@ -211,9 +211,9 @@ def test_distances_of_solved_surveys_are_in_their_intervals() -> None:
         found = survey.covariance(anchor_ids=[f"A{k}" for k in range(len(ANCHORS_M))])
         anchors_m = {f"A{k}": at for k, at in enumerate(survey.anchors)}
         true_m |= {f"A{k}": at for k, at in enumerate(ANCHORS_M)}
-        map_ = MeasuredMap(MapPoints(reconstruction, anchors_m, {}, 1.0), found.errors, found.errors.scale_stddev, None)
+        points = MapPoints(reconstruction, anchors_m, {}, 1.0)
         pairs = [tuple(rng.choice([*true_m], 2, replace=False).tolist()) for _ in range(30)]
-        for row in map_.measure(pairs):
+        for row in measured(points, pairs, found.errors, found.errors.scale_stddev, None):
             low, high = row.distance_interval_m
             inside.append(low <= np.linalg.norm(true_m[row.ends[0]] - true_m[row.ends[1]]) <= high)
     # The distances of one survey share the error of its scale, so only the surveys are independent of each other.

@@ -72,7 +72,7 @@ def test_how_another_tape_was_read_is_said(tmp_path: Path) -> None:
 
 def test_points_with_the_usual_names_may_have_decimal_commas(tmp_path: Path) -> None:
     path = write(tmp_path / "p.csv", "marker;x_m;y_m;z_m;stddev_m;kind\nP1;1,5;2;3;0,01;check\nP2;4;5,25;6;0,02;\n")
-    points = read_control_points(PointOptions(path=path), None)
+    points = read_control_points(PointOptions(path=path))
     assert points is not None
     np.testing.assert_array_equal(points.positions_m, [[1.5, 2, 3], [4, 5.25, 6]])
     assert [(point.stddev_m, point.kind) for point in points.points] == [(0.01, "check"), (0.02, "control")]

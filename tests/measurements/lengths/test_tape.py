@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.measurements.lengths.tape_file import read_tape
+from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
 
 
 def write(path: Path, text: str) -> Path:
@@ -29,11 +29,10 @@ def test_distances_are_control_and_good_to_a_centimetre_unless_said_otherwise(tm
 
 
 def test_marks_are_gathered_by_marker(tmp_path: Path) -> None:
-    distances = write(tmp_path / "d.csv", "from,to,distance_m\ndoor,wall,2\n")
     markers = write(
         tmp_path / "m.csv", "marker,image_name,x_px,y_px\ndoor,a.jpg,1,2\nwall,a.jpg,3,4\ndoor,b.jpg,5,6.5\n"
     )
-    found = read_tape(distances, markers).markers
+    found = read_markers(markers)
     assert found["door"].image_names == ("a.jpg", "b.jpg")
     np.testing.assert_array_equal(found["door"].pixels, [[1, 2], [5, 6.5]])
     assert found["door"].lines == (2, 4)
@@ -57,7 +56,6 @@ def test_a_wrong_table_of_distances_is_named(text: str, said: str, tmp_path: Pat
 
 
 def test_a_marker_twice_in_one_photo_is_refused(tmp_path: Path) -> None:
-    distances = write(tmp_path / "d.csv", "from,to,distance_m\ndoor,wall,2\n")
     markers = write(tmp_path / "m.csv", "marker,image_name,x_px,y_px\ndoor,a.jpg,1,2\ndoor,a.jpg,5,6.5\n")
     with pytest.raises(InputError, match=r"m.csv:3: image_name is 'a.jpg', expected each photo once"):
-        read_tape(distances, markers)
+        read_markers(markers)

@@ -19,11 +19,11 @@ def read(folder: Path, text: str, markers: str | None = None, **options: object)
     """Write a file and read it."""
     path, markers_path = folder / "points.txt", folder / "markers.csv"
     path.write_text(text)
-    if markers is not None:
-        markers_path.write_text(f"marker,image_name,x_px,y_px\n{markers}")
-    found = read_control_points(PointOptions().changed(path=path, **options), None if markers is None else markers_path)
-    assert found is not None
-    return found
+    found = read_control_points(PointOptions().changed(path=path, **options))
+    if markers is None:
+        return found
+    markers_path.write_text(f"marker,image_name,x_px,y_px\n{markers}")
+    return found.with_more(read_markers(markers_path))
 
 
 def test_the_canonical_table_has_coordinates_stddevs_and_kinds(tmp_path: Path) -> None:

@@ -56,20 +56,18 @@ class LocatedDistances:
     by_pose: csr_array
 
     @classmethod
-    def control(
-        cls,
-        distance_m: Array,
-        stddev_m: Array,
-        *,
-        model_length: Array | None = None,
-        anchor_pair: Indices | None = None,
-    ) -> LocatedDistances:
-        """Make control lengths, between anchors or between points whose positions are unknown."""
+    def between_points(cls, distance_m: Array, stddev_m: Array, model_length: Array) -> LocatedDistances:
+        """Make control lengths between points whose positions are unknown."""
         k = len(distance_m)
-        length = np.full(k, np.nan) if model_length is None else model_length
-        pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
         no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
-        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no, csr_array((k, 0)))
+        pair = np.full((k, 2), -1, dtype=np.int64)
+        return cls(model_length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no, csr_array((k, 0)))
+
+    @classmethod
+    def between_anchors(cls, distance_m: Array, stddev_m: Array, anchor_pair: Indices) -> LocatedDistances:
+        """Make control lengths between anchors."""
+        unknown = np.full(len(distance_m), np.nan)
+        return replace(cls.between_points(distance_m, stddev_m, unknown), anchor_pair=anchor_pair)
 
     @property
     def is_between_points(self) -> Mask:
@@ -130,18 +128,13 @@ class LocatedDistances:
         return jacobian
 
 
-NO_DISTANCES = LocatedDistances.control(np.zeros(0), np.zeros(0))
+NO_DISTANCES = LocatedDistances.between_points(*np.zeros((3, 0)))
 
 
-def locate_distances(
-    tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str], path: Trajectory | None = None
-) -> LocatedDistances:
-    """Find the ends of measured lengths in a model.
+def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:
+    """Find the ends of measured lengths in a model, without derivatives by its poses.
 
     An end is the photo of that name (its projection centre), else the marker, else the anchor.
-
-    Args:
-        path: of the model, by whose poses the derivatives are; None: they are not needed.
 
     Raises:
         InputError: an end is none of these, a photo is not in the model, only one of the two ends is an anchor, or the
@@ -149,8 +142,6 @@ def locate_distances(
     """
     images, markers = images_by_name(model), triangulate_markers(tape, model)
     points = {name: image.projection_center() for name, image in images.items()} | markers
-    finder = MapPoints(model, {}, tape.markers, np.nan)
-    slopes = np.zeros((len(tape.distances), 0 if path is None else 6 * len(path)))
     ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
     pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
@@ -160,11 +151,6 @@ def locate_distances(
             marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
             of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
             mark_stddev[row] = np.sqrt(variance_along(ends[row, 0], ends[row, 1], sum(of_ends, np.zeros((3, 3)))))
-            if path is not None and not taped.is_everywhere:
-                found = [finder.find_marker(name) if name in markers else finder.find(name) for name in taped.ends]
-                apart = by_pose(found[1], path) - by_pose(found[0], path)
-                away = ends[row, 1] - ends[row, 0]
-                slopes[row] = away / max(float(np.linalg.norm(away)), 1e-12) @ apart
         elif start in anchor_ids and end in anchor_ids:
             pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
         else:
@@ -179,8 +165,21 @@ def locate_distances(
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
         np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
-        csr_array(slopes),
+        csr_array((len(tape.distances), 0)),
     )
+
+
+def lengths_by_pose(
+    located: LocatedDistances, tape: Tape, model: pycolmap.Reconstruction, path: Trajectory
+) -> csr_array:
+    """Return the derivatives of the model's lengths, as of ``LocatedDistances``, by the poses of its path."""
+    finder, slopes = MapPoints(model, {}, tape.markers, np.nan), np.zeros((len(located), 6 * len(path)))
+    for row in np.flatnonzero(located.is_between_points & ~located.is_everywhere).tolist():
+        names = tape.distances[row].ends
+        start, end = (finder.find_marker(name) if name in tape.markers else finder.find(name) for name in names)
+        away = located.ends[row, 1] - located.ends[row, 0]
+        slopes[row] = away / max(float(np.linalg.norm(away)), 1e-12) @ (by_pose(end, path) - by_pose(start, path))
+    return csr_array(slopes)
 
 
 def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str], *, may_be_tags: bool) -> None:

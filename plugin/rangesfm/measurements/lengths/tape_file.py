@@ -22,17 +22,16 @@ from rangesfm.util.files.text_tables import read_head, repeated
 DEFAULT_STDDEV_M = 0.01
 
 
-def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> Tape:
-    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``, or other tables of these.
+def read_tape(path: AnyPath) -> Tape:
+    """Read ``from,to,distance_m[,stddev_m,kind]``, or another table of these.
 
     A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
 
     Raises:
-        InputError: a file is not valid; the error gives the line.
+        InputError: the file is not valid; the error gives the line.
     """
-    listed = LENGTHS.read(Path(distances_path))
-    markers = {} if markers_path is None else read_markers(markers_path)
-    return Tape(_distances(listed), markers, Path(distances_path), listed.notes)
+    listed = LENGTHS.read(Path(path))
+    return Tape(_distances(listed), distances_path=Path(path), notes=listed.notes)
 
 
 def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
 from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
-from rangesfm.measurements.lengths.tape_file import markers_of_metashape, read_markers
+from rangesfm.measurements.lengths.tape_file import markers_of_metashape
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_log import crs_in_text, crs_of_line
 from rangesfm.measurements.ranges.anchors.anchor_file import find_anchor_columns, like_anchors
@@ -36,14 +36,13 @@ _EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
 _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
 
 
-def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints:
+def read_control_points(options: PointOptions) -> ControlPoints:
     """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` another table, ODM's ``gcp_list.txt``, or Metashape's markers.
 
     A point without a kind is a control point.
 
     Args:
         options: which name the file; none: there are no points.
-        markers_path: file of the marks in photos; None: those of ``gcp_list.txt`` or Metashape, or printed tags.
 
     Raises:
         UnclearListError: the columns are not known for sure; the advice says what to type.
@@ -53,9 +52,8 @@ def read_control_points(options: PointOptions, markers_path: Path | None) -> Con
     if path is None:
         return ControlPoints()
     head = read_head(path)
-    markers = {} if markers_path is None else read_markers(markers_path)
     read = _gcp_list if is_gcp_list(head) else _metashape if is_metashape_file(head) else _table
-    return read(path, options, head).with_more(markers)
+    return read(path, options, head)
 
 
 def is_gcp_list(head: str) -> bool:

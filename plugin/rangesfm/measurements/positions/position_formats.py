@@ -233,7 +233,8 @@ def _is_tum(head: str) -> bool:
 def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
     table = tum_table(path)
     times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
-    return PositionLog.in_time_order(path, "tum", np.column_stack(places), table.line, times_s=times_s)
+    at_m, unknown_m2 = np.column_stack(places), np.full((len(table), 3, 3), np.nan)
+    return PositionLog.in_time_order(path, "tum", at_m, table.line, times_s=times_s, covariance_m2=unknown_m2)
 
 
 def _is_odm(head: str) -> bool:
@@ -307,9 +308,10 @@ def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
     if wanted not in ids:
         raise InputError(f"has positions of {', '.join(sorted(set(ids)))}: say which it is (--position_tag_id)", path)
     kept = np.array(ids) == wanted
-    values = np.array(rows)[kept]
+    values, of_rows = np.array(rows)[kept], np.array(lines)[kept]
+    times_s, unknown_m2 = values[:, 0] / 1e3, np.full((len(values), 3, 3), np.nan)
     return PositionLog.in_time_order(
-        path, "marvelmind", values[:, 1:], np.array(lines)[kept], times_s=values[:, 0] / 1e3
+        path, "marvelmind", values[:, 1:], of_rows, times_s=times_s, covariance_m2=unknown_m2
     )
 
 

@@ -83,9 +83,9 @@ class PositionLog:
         position_m: Array,
         line: Sequence[int] | Indices,
         *,
+        covariance_m2: Array,
         times_s: Array | None = None,
         image_name: Sequence[str] | None = None,
-        covariance_m2: Array | None = None,
         notes: Sequence[str] = (),
     ) -> PositionLog:
         """Make a log in the order of time, without rows that have no position or the time of an earlier one.
@@ -103,7 +103,6 @@ class PositionLog:
             raise InputError(f"{lost} (read as {format})", path)
         if num < total:
             told.append(f"{total - num} of {total} rows have no position (no fix) and are left out")
-        covariance_m2 = np.full((total, 3, 3), np.nan) if covariance_m2 is None else covariance_m2
         if times_s is not None:
             order = rows[np.argsort(times_s[rows], kind="stable")]
             rows = order[np.append(True, np.diff(times_s[order]) > 0)]

@@ -92,12 +92,9 @@ def test_prediction_is_the_hand_computed_one() -> None:
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-5, 0.5, 2.5])
 def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generator, turn_rad: float) -> None:
     start = random_state(rng)
-    taped = LocatedDistances.control(
-        np.array([3.0, 5.0, 4.0]),
-        np.array([0.1, 0.2, 0.5]),
-        model_length=np.array([2.0, np.nan, np.nan]),
-        anchor_pair=np.array([[-1, -1], [0, 1], [2, 1]]),
-    )
+    lengths_m, stddevs_m = np.array([3.0, 5.0, 4.0]), np.array([0.1, 0.2, 0.5])
+    taped = LocatedDistances.between_points(lengths_m, stddevs_m, np.array([2.0, np.nan, np.nan]))
+    taped = replace(taped, anchor_pair=np.array([[-1, -1], [0, 1], [2, 1]]))
     problem = replace(random_problem(rng, random_state(rng)), distances=taped, gravity=gravity_of((0.3, -1.0, 0.2)))
     (columns,) = range_equation.columns_of([problem])
     assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS

@@ -138,6 +138,6 @@ def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit:
     for each in others:
         if each.is_used and not each.places_map:
             alone = each.alone.scale
-            length = LocatedDistances.control(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
+            length = LocatedDistances.between_points(unit * alone.value * one, unit * alone.stddev * one, one)
             found = length.joined(found)
     return found

@@ -189,7 +189,7 @@ def scale_problem(
         measured += _between_surveyed(in_log, surveyed & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
     pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
-    measured.append(LocatedDistances.control(length_m, stddev_m, anchor_pair=pairs))
+    measured.append(LocatedDistances.between_anchors(length_m, stddev_m, pairs))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], given.trajectory),
@@ -290,4 +290,4 @@ def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDis
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
     ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs])
-    return [LocatedDistances.control(lengths_m, stddevs_m, anchor_pair=ends)] if pairs else []
+    return [LocatedDistances.between_anchors(lengths_m, stddevs_m, ends)] if pairs else []
