@@ -30,8 +30,8 @@ _MODELS = {
 
 def colmap_camera(
     distortion: str, pinhole: Iterable[float], coefficients: Iterable[float], path: Path
-) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's name of a camera model, and its parameters.
+) -> CameraOptions:
+    """Return a calibrated camera as COLMAP's model with its parameters.
 
     Args:
         distortion: the distortion model's name in Kalibr or ROS.
@@ -39,7 +39,7 @@ def colmap_camera(
         path: the file that they are from, for messages.
 
     Raises:
-        InputError: COLMAP has no such model.
+        InputError: COLMAP has no such model, or a parameter is out of bounds.
     """
     if distortion not in _MODELS:
         raise InputError(f"distortion_model is '{distortion}', expected one of {', '.join(_MODELS)}", path)
@@ -48,7 +48,8 @@ def colmap_camera(
     if model == "OPENCV" and any(given[num:]):  # there is a third radial coefficient
         model, num = "FULL_OPENCV", 8
     fx, fy, cx, cy = map(float, pinhole)
-    return model, (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
+    params = (fx, fy, cx + _CORNER_PX, cy + _CORNER_PX, *[*given, *[0.0] * num][:num])
+    return CameraOptions(model=model, params=params)
 
 
 def calibrated_cameras(model: str, params: Sequence[float], sizes: Iterable[Size]) -> dict[Size, pycolmap.Camera]:

@@ -163,8 +163,8 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
     journal.note(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera
-    if taken.camera is not None and not (given.model or given.params or given.others):
-        values["camera.model"], values["camera.params"] = taken.camera
+    if taken.camera.model and not (given.model or given.params or given.others):
+        values |= {"camera.model": taken.camera.model, "camera.params": taken.camera.params}
     return survey.changed(values)
 
 

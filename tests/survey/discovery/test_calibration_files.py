@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,34 +44,45 @@ distortion_coefficients:
 """
 
 
+def calibrated(model: str, params: tuple[float, ...], *more: Any) -> CameraCalibration:
+    return CameraCalibration(CameraOptions(model=model, params=params), *more)
+
+
 def read(path: Path, text: str) -> tuple[CameraCalibration, ...]:
     path.write_text(text)
     cameras = read_calibrations(path)
     for camera in cameras:
-        check_camera(CameraOptions(model=camera.model, params=camera.params))
+        check_camera(camera.camera)
     return cameras
 
 
 def test_kalibrs_cameras_are_moved_by_half_a_pixel(tmp_path: Path) -> None:
     assert read(tmp_path / "camchain.yaml", KALIBR) == (
-        CameraCalibration("OPENCV", (458.6, 457.3, 367.2, 248.9, -0.28, 0.07, 0.0002, 0.00002), (752, 480)),
-        CameraCalibration("OPENCV_FISHEYE", (457.6, 456.1, 380.0, 255.7, -0.01, 0.02, 0.003, 0.004), (640, 480)),
+        CameraCalibration(
+            CameraOptions(model="OPENCV", params=(458.6, 457.3, 367.2, 248.9, -0.28, 0.07, 0.0002, 0.00002)), (752, 480)
+        ),
+        CameraCalibration(
+            CameraOptions(model="OPENCV_FISHEYE", params=(457.6, 456.1, 380.0, 255.7, -0.01, 0.02, 0.003, 0.004)),
+            (640, 480),
+        ),
     )
 
 
 def test_a_ros_camera_with_a_third_coefficient_is_full_opencv(tmp_path: Path) -> None:
     pinhole, four = (430.2, 430.5, 307.2, 227.7), (-0.34, 0.11, 0.0003, -0.0001)
     (plain,) = read(tmp_path / "plain.yaml", ROS.format(third=0.0))
-    assert plain == CameraCalibration("OPENCV", (*pinhole, *four), (640, 480))
+    assert plain == calibrated("OPENCV", (*pinhole, *four), (640, 480))
     (full,) = read(tmp_path / "full.yml", ROS.format(third=0.05))
-    assert full == CameraCalibration("FULL_OPENCV", (*pinhole, *four, 0.05, 0.0, 0.0, 0.0), (640, 480))
+    assert full == CameraCalibration(
+        CameraOptions(model="FULL_OPENCV", params=(*pinhole, *four, 0.05, 0.0, 0.0, 0.0)), (640, 480)
+    )
 
 
 def test_colmaps_cameras_are_taken_as_they_are(tmp_path: Path) -> None:
     text = "# Camera list\n1 PINHOLE 640 480 500 501 320 240\n2 SIMPLE_RADIAL 480 640 500 240 320 0.01\n"
     assert read(tmp_path / "cameras.txt", text) == (
-        CameraCalibration("PINHOLE", (500, 501, 320, 240), (640, 480)),
-        CameraCalibration("SIMPLE_RADIAL", (500, 240, 320, 0.01), (480, 640)),
+        calibrated("PINHOLE", (500, 501, 320, 240), (640, 480)),
+        calibrated("SIMPLE_RADIAL", (500, 240, 320, 0.01), (480, 640)),
     )
 
 
@@ -83,7 +95,7 @@ def test_a_camera_as_json_may_have_the_lever_arm(tmp_path: Path) -> None:
         "tag_in_cam_m": [0, 1, 2],
     }
     assert read(tmp_path / "any.json", json.dumps(camera)) == (
-        CameraCalibration("PINHOLE", (50, 50, 32, 24), (64, 48), (0, 1, 2)),
+        calibrated("PINHOLE", (50, 50, 32, 24), (64, 48), (0, 1, 2)),
     )
 
 

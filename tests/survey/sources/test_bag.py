@@ -17,6 +17,7 @@ from tests.survey.sources.damage import DAMAGES, Damage
 from tests.survey.sources.recorded import Message, camera_info, compressed, raw, write_bag
 
 from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions
 from rangesfm.survey.sources.source import PhotoSource, open_source
 
 Pixels = npt.NDArray[np.uint8]
@@ -114,7 +115,7 @@ def test_a_compressed_image_is_the_photo_byte_for_byte(tmp_path: Path) -> None:
     assert (frame.suffix, frame.grey().mode, source.size_px) == (".jpg", "L", (8, 6))
     frame.write(tmp_path / "photo.jpg")
     assert (tmp_path / "photo.jpg").read_bytes() == content.getvalue()
-    assert source.camera is not None
+    assert source.camera.model
 
 
 def test_times_are_the_stamps_and_without_any_the_arrivals(tmp_path: Path) -> None:
@@ -152,10 +153,10 @@ def test_the_camera_is_that_of_the_info_beside_the_images(version: int, tmp_path
         ("/cam/camera_info", INFO, 1.0, INFO_OF_8_X_6),
     ]
     plain = open_bag(tmp_path, messages, topic="/cam/image_raw", version=version)
-    assert plain.camera == ("OPENCV", (9.0, 10.0, 4.5, 3.5, 0.1, 0.0, 0.0, 0.0))
+    assert plain.camera == CameraOptions(model="OPENCV", params=(9.0, 10.0, 4.5, 3.5, 0.1, 0.0, 0.0, 0.0))
     assert plain.notes == ("the camera is that of /cam/camera_info, unless one is given",)
     rectified = open_source(next(tmp_path.iterdir()), "/cam/image_rect")
-    assert rectified.camera == ("PINHOLE", (4.5, 5.0, 4.5, 3.5))
+    assert rectified.camera == CameraOptions(model="PINHOLE", params=(4.5, 5.0, 4.5, 3.5))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +173,7 @@ def test_the_camera_is_that_of_the_info_beside_the_images(version: int, tmp_path
 )
 def test_an_info_that_does_not_fit_is_not_taken(info: dict[str, Any], notes: tuple[str, ...], tmp_path: Path) -> None:
     source = open_bag(tmp_path, [("/image", IMAGE, 1.0, raw(gradient(), "rgb8")), ("/camera_info", INFO, 1.0, info)])
-    assert source.camera is None
+    assert source.camera == CameraOptions()
     assert len(source.notes) == len(notes)
     for found, expected in zip(source.notes, notes):
         assert re.match(expected, found)

@@ -11,6 +11,7 @@ from PIL import Image
 from tests.outputs import names_in
 
 from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions
 from rangesfm.progress import Progress
 from rangesfm.sfm.image_times import read_image_times_csv
 from rangesfm.survey.sources import extract
@@ -28,6 +29,9 @@ def frame(number: int, time_s: float, how: str = "blurred") -> Frame:
     return Frame(number, time_s, ".png", lambda: image, image.save)
 
 
+CAMERA = CameraOptions(model="PINHOLE", params=(9.0, 9.0, 4.0, 4.0))
+
+
 class Film:
     """A source of frames in place of a video, which counts how often it is read."""
 
@@ -36,9 +40,7 @@ class Film:
         path.write_text("a film")
 
     def open(self, path: Path, topic: str) -> PhotoSource:
-        return PhotoSource(
-            "a film", (8, 8), 2.0, 8, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",)
-        )
+        return PhotoSource("a film", (8, 8), 2.0, 8, "its own", self.watch, CAMERA, ("in black",))
 
     def watch(self) -> Iterator[Frame]:
         self.num_watched += 1
@@ -86,7 +88,7 @@ def test_photos_come_with_their_times_and_what_is_known_of_them(film: Film) -> N
     times = read_image_times_csv(folder / "images.csv", names)
     assert times.by_name() == dict(zip(names, (100.0, 100.5, 101.0, 101.5)))
     assert {path.name for path in folder.iterdir()} == {*names, "images.csv", "photos.json"}
-    assert taken.camera == ("PINHOLE", (9.0, 9.0, 4.0, 4.0))
+    assert taken.camera == CAMERA
     assert taken.notes == ("the photos are the sharpest of each 0.5 s of film.mp4; their times are its own", "in black")
 
 

@@ -14,7 +14,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from rangesfm.colmap.calibrated_cameras import colmap_camera
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, OptionError
+from rangesfm.options import CameraOptions
 from rangesfm.util.files.text_tables import read_head
 
 _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)", re.ASCII)
@@ -25,15 +26,13 @@ class CameraCalibration:
     """One calibrated camera in COLMAP's conventions.
 
     Attributes:
-        model: COLMAP's name of the camera model.
-        params: in COLMAP's order and pixel convention.
+        camera: with its parameters, in COLMAP's order and pixel convention.
         size_px: width and height of its photos; None if the file does not say.
         tag_in_cam_m: lever arm of the radio's tag; None if the file does not say.
         cam_from_imu: (4, 4) rows of kalibr's T_cam_imu; None if the file does not say.
     """
 
-    model: str
-    params: tuple[float, ...]
+    camera: CameraOptions
     size_px: tuple[int, int] | None = None
     tag_in_cam_m: tuple[float, float, float] | None = None
     cam_from_imu: tuple[tuple[float, ...], ...] | None = None
@@ -47,7 +46,7 @@ def read_calibrations(path: Path) -> tuple[CameraCalibration, ...]:
     """
     try:
         return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+    except (OptionError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"the calibration of a camera is not complete ({what})", path) from None
 
@@ -57,7 +56,8 @@ def _read_colmap(path: Path) -> Iterator[CameraCalibration]:
     found = [_COLMAP_LINE.fullmatch(line) for line in lines if line and not line.startswith("#")]
     for match in found if all(found) else ():
         assert match is not None
-        yield CameraCalibration(match[1], tuple(map(float, match[4].split())), (int(match[2]), int(match[3])))
+        camera = CameraOptions(model=match[1], params=tuple(map(float, match[4].split())))
+        yield CameraCalibration(camera, (int(match[2]), int(match[3])))
 
 
 def _read_json(path: Path) -> Iterator[CameraCalibration]:
@@ -69,7 +69,8 @@ def _read_json(path: Path) -> Iterator[CameraCalibration]:
         size_px = (int(camera["width"]), int(camera["height"])) if "width" in camera else None
         arm = camera.get("tag_in_cam_m")
         tag_in_cam_m = None if arm is None else (float(arm[0]), float(arm[1]), float(arm[2]))
-        yield CameraCalibration(camera["camera_model"], tuple(map(float, camera["params"])), size_px, tag_in_cam_m)
+        given = CameraOptions(model=camera["camera_model"], params=tuple(map(float, camera["params"])))
+        yield CameraCalibration(given, size_px, tag_in_cam_m)
 
 
 def _read_yaml(path: Path) -> Iterator[CameraCalibration]:
@@ -108,8 +109,7 @@ def _rigid(rows: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> CameraCalibration:
-    model, params = colmap_camera(distortion, pinhole, coefficients, path)
-    return CameraCalibration(model, params, (int(size[0]), int(size[1])))
+    return CameraCalibration(colmap_camera(distortion, pinhole, coefficients, path), (int(size[0]), int(size[1])))
 
 
 _READERS = {".txt": _read_colmap, ".json": _read_json, ".yaml": _read_yaml, ".yml": _read_yaml}

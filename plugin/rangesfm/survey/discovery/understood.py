@@ -260,7 +260,8 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     size_px = _size_px(values)
     fitting = [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
     if len(fitting) == 1:
-        values |= {"camera.model": fitting[0].model, "camera.params": fitting[0].params}
+        camera = fitting[0].camera
+        values |= {"camera.model": camera.model, "camera.params": camera.params}
         notes.append(f"the camera is that of {path.name}")
     else:
         sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)

@@ -19,6 +19,7 @@ from scipy.ndimage import convolve
 
 from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions
 from rangesfm.survey.sources.source import MAX_SIDE_PX, Frame, PhotoSource
 from rangesfm.util.files.bags import messages_of, open_bag, stamp_s, type_name
 
@@ -104,33 +105,34 @@ def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
 
 def _camera(
     bag: AnyReader, topic: str, kind: str, size_px: tuple[int, int], path: Path
-) -> tuple[tuple[str, tuple[float, ...]] | None, tuple[str, ...]]:
-    """Return COLMAP's camera model and parameters from the CameraInfo that belongs to an image topic, and notes on it.
+) -> tuple[CameraOptions, tuple[str, ...]]:
+    """Return the camera from the CameraInfo that belongs to an image topic, and notes on it.
 
-    The camera is None where there is no CameraInfo, or where it does not fit the images.
+    Nothing of it is given where there is no CameraInfo, or where it does not fit the images.
     """
+    not_given = CameraOptions()
     infos = [item.topic for item in bag.connections if type_name(item.msgtype) == _CAMERA]
     beside = [topic.rpartition("/")[0]]
     beside += [beside[0].rpartition("/")[0]] if kind == _COMPRESSED else []  # for /camera/image_raw/compressed
     info_topic = next((info for place in beside for info in infos if info.rpartition("/")[0] == place), None)
     found = None if info_topic is None else next(_messages(bag, info_topic), None)
     if found is None:
-        return None, ()
+        return not_given, ()
     info = found[1]
     d, k, p = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "dkp")  # ROS 1: D, K, P
     is_rectified = "rect" in topic.rpartition("/")[2] or "rect" in beside[0].rpartition("/")[2]
     fx, cx, fy, cy = p[[0, 2, 5, 6]] if is_rectified else k[[0, 2, 4, 5]]
     if not (fx > 0 and fy > 0):
-        return None, ()  # the camera is not calibrated
+        return not_given, ()  # the camera is not calibrated
     if (info.width, info.height) != size_px:
-        return None, (f"{info_topic} is for {info.width} x {info.height} pixels: it is not used for the camera",)
+        return not_given, (f"{info_topic} is for {info.width} x {info.height} pixels: it is not used for the camera",)
     distortion = info.distortion_model if not is_rectified and any(d) else "none"
     try:
         return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (
             f"the camera is that of {info_topic}, unless one is given",
         )
     except InputError as error:
-        return None, (f"{info_topic} is not used for the camera: {error}",)
+        return not_given, (f"{info_topic} is not used for the camera: {error}",)
 
 
 def _grey(message: Any, path: Path) -> Image.Image:

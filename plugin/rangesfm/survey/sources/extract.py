@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 
 from rangesfm.errors import InputError
+from rangesfm.options import CameraOptions
 from rangesfm.progress import Progress
 from rangesfm.survey.sources.source import Frame, PhotoSource, open_source
 from rangesfm.util.files.atomic import new_folder
@@ -30,14 +31,14 @@ class TakenPhotos(Record):
         files: state (see ``state_and_sha256``) and SHA-256 of each file of the source by name.
         rate_hz, topic: the user's choice of photos.
         image_names: names of the photos in order of time.
-        camera: COLMAP's camera model and parameters, if the source has them.
+        camera: if the source says it.
     """
 
     files: _Files
     rate_hz: float
     topic: str
     image_names: tuple[str, ...] = ()
-    camera: tuple[str, tuple[float, ...]] | None = None
+    camera: CameraOptions = CameraOptions()
     notes: tuple[str, ...] = ()
 
     @property

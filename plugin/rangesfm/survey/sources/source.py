@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rangesfm.options import CameraOptions
 from rangesfm.util.files.bags import is_bag
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class PhotoSource:
         num_frames: number of frames by the header of the file; 0 where it does not say.
         clock: description of the times, for the user.
         frames: function that yields all frames in their order.
-        camera: COLMAP's camera model and parameters, if the source has them.
+        camera: if the source says it.
     """
 
     what: str
@@ -62,7 +63,7 @@ class PhotoSource:
     num_frames: int
     clock: str
     frames: Callable[[], Iterator[Frame]]
-    camera: tuple[str, tuple[float, ...]] | None = None
+    camera: CameraOptions = CameraOptions()
     notes: tuple[str, ...] = ()
 
     def num_photos(self, rate_hz: float) -> int:
