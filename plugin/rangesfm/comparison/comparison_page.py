@@ -67,12 +67,14 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
         ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model.num_images() > 0)
         for i, (model, path) in enumerate(zip(models, aligned))
     ]
+    given = {} if base.result is None else base.result.summary.anchors
+    anchors = {id_: anchor for id_, anchor in given.items() if anchor.position_m is not None}
     return Scene(
         frame=frame,
         paths=(*paths[1:], paths[0]),
         points_m=points_m,
         points_rgb=points_rgb,
-        anchors={} if base.result is None else base.result.summary.anchors,
+        anchors=anchors,
         unit=_unit(base),
     )
 

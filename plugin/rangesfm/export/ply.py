@@ -53,7 +53,7 @@ def write_anchor_vertices(anchors_m: Mapping[str, Array], path: Path) -> Path:
 
 
 def _write_vertices(
-    path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str | None = None
+    path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str = ""
 ) -> Path:
     """Write vertices with positions (n, 3), colours (n, 3) or one for all, and perhaps normals (n, 3).
 

@@ -152,18 +152,17 @@ def _layer(kind: str, rows: list[Spec], encoding: Spec | None = None, **mark: An
 def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:
     layers = []
     to_x2: Spec = {"x2": {"field": "x2"}}
-    if panel.picture is not None:
+    if panel.picture.size:
         corners = dict(zip(("x", "x2", "y", "y2"), (*x_range, *y_range)))
         encoding = to_x2 | {"y2": {"field": "y2"}}
         colors = Image.fromarray(panel.picture).quantize(_NUM_PICTURE_COLORS, method=Image.Quantize.FASTOCTREE)
         layers.append(_layer("image", [corners], encoding, url=data_uri(colors, "PNG"), aspect=False))
-    if panel.band is not None:
-        _, low, high = panel.band
+    for _, low, high in panel.bands:
         layers.append(_layer("rect", [{"x": low, "x2": high}], to_x2 | {"y": None}, color=css("interval")))
     if panel.zero_line:
         layers.append(_layer("rule", [{"y": 0.0}], {"x": None}, color=css("ink")))
-    if panel.line is not None:
-        layers.append(_layer("rule", [{"x": panel.line[1]}], {"y": None}, color=css("ink"), size=1.5))
+    for _, x in panel.lines:
+        layers.append(_layer("rule", [{"x": x}], {"y": None}, color=css("ink"), size=1.5))
     return layers
 
 

@@ -38,7 +38,7 @@ def mistakes_figure(content: Content) -> Iterator[Figure]:
         [math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0 for test in shown],
         [_size(test) for test in shown],
         _MOST_EVIDENCE,
-        line=("beyond chance", 1.0),
+        lines=(("beyond chance", 1.0),),
     )
     low, high = content.summary.scale.interval_95 or (1.0, 1.0)
     could_hide = _panel(
@@ -49,7 +49,7 @@ def mistakes_figure(content: Content) -> Iterator[Figure]:
         [_effect_percent(test) for test in shown],
         [_smallest(test) for test in shown],
         _MOST_EFFECT_PERCENT,
-        band=("half of the scale's 95 % interval", 0.0, 50 * math.log(high / low)),
+        bands=(("half of the scale's 95 % interval", 0.0, 50 * math.log(high / low)),),
     )
     caption = (
         "Tests of possible mistakes. Left: the evidence for each mistake in the measurements, with its estimated size; "

@@ -77,7 +77,7 @@ def residual_histogram(content: Content) -> Iterator[Figure]:
         outlines,
         x_range=(-limit, limit),
         y_range=from_zero(outlines),
-        line=("", 0.0),
+        lines=(("", 0.0),),
     )
 
 

@@ -39,8 +39,8 @@ def scale_per_anchor_figure(content: Content) -> Iterator[Figure]:
         "Scale from each anchor alone against the scale from all",
         ("scale m per unit", ""),
         (),
-        line=("all anchors", joint),
-        band=None if scale.interval_95 is None else ("95 % interval", *scale.interval_95),
+        lines=(("all anchors", joint),),
+        bands=(("95 % interval", *scale.interval_95),) if scale.interval_95 else (),
         marks=tuple(marks),
         x_range=(joint - half, joint + half),
         y_range=(len(alone) - 0.5, -0.5),
@@ -92,7 +92,7 @@ def consensus(content: Content) -> Iterator[Figure]:
         "Number of ranges that agree with each scale",
         ("scale m per unit", "ranges"),
         (curve,),
-        line=("scale found", content.summary.metric_from_sfm.scale),
+        lines=(("scale found", content.summary.metric_from_sfm.scale),),
         y_range=from_zero([curve]),
     )
 
@@ -110,5 +110,5 @@ def clock_curve(content: Content) -> Iterator[Figure]:
         "Misfit of the ranges for each clock offset",
         ("time offset s", "misfit"),
         [Series("misfit", "after", np.column_stack([table.time_offset_s, table.cost]), "line")],
-        line=None if offset is None else ("offset used", offset),
+        lines=() if offset is None else (("offset used", offset),),
     )

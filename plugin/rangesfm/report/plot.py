@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,8 +74,8 @@ class Panel:
         size: width and height between the axes, in pixels.
         keeps_shape: whether its height follows its width, so that both axes keep the same scale.
         zero_line: whether a line marks zero on the y axis.
-        line: name and x of a vertical line over the whole height.
-        band: name and both ends on the x axis of a vertical strip over the whole height.
+        lines: name and x of vertical lines over the whole height.
+        bands: name and both ends on the x axis of vertical strips over the whole height.
         rows: y, left label and right label of each row; they replace the numbers on the y axis.
         picture: (h, w, 4) red, green, blue, opacity, behind the series and over the whole panel; top row first.
     """
@@ -90,10 +90,10 @@ class Panel:
     size: tuple[float, float] = (400.0, 200.0)
     keeps_shape: bool = False
     zero_line: bool = False
-    line: tuple[str, float] | None = None
-    band: tuple[str, float, float] | None = None
+    lines: tuple[tuple[str, float], ...] = ()
+    bands: tuple[tuple[str, float, float], ...] = ()
     rows: tuple[tuple[float, str, str], ...] = ()
-    picture: Pixels | None = None
+    picture: Pixels = field(default_factory=lambda: np.zeros((0, 0, 4), dtype=np.uint8))
 
     @property
     def limits(self) -> tuple[Range, Range]:
@@ -136,8 +136,8 @@ class Figure:
         given = [(one.name, one.color, one.kind) for panel in self.panels for one in panel.series if len(one.points)]
         for panel in self.panels:
             given += [(mark.name, mark.color, mark.shape) for mark in panel.marks]
-            given += [(panel.line[0], "ink", "upright")] if panel.line else []
-            given += [(panel.band[0], "interval", "strip")] if panel.band else []
+            given += [(name, "ink", "upright") for name, _ in panel.lines]
+            given += [(name, "interval", "strip") for name, _, _ in panel.bands]
         return {text: (color, shape) for text, color, shape in given if text}
 
 

@@ -18,7 +18,7 @@ from rangesfm.report.content import Content
 from rangesfm.report.facts import facts_of
 from rangesfm.report.figures_loops import loops_figure
 from rangesfm.report.plot import Figure
-from rangesfm.report.scene import scene_of, view_of
+from rangesfm.report.scene import view_of_result
 from rangesfm.util.files.atomic import new_file
 
 if TYPE_CHECKING:
@@ -105,7 +105,6 @@ def sections_of(content: Content) -> list[Section]:
 
 def render_report(content: Content) -> str:
     """Return the HTML text of the report of a result."""
-    scene = scene_of(content)
     return render_page(
         "report.html",
         title=f"{content.title} – rangesfm report",
@@ -113,7 +112,7 @@ def render_report(content: Content) -> str:
         summary=content.summary,
         checks=quality_checks(content.summary),
         facts=facts_of(content),
-        view=None if scene is None else view_of(scene),
+        view=view_of_result(content),
         sections=sections_of(content),
     )
 

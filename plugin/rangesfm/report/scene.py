@@ -6,7 +6,7 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,6 @@ _MAX_DECODED_PIXELS = 100_000_000
 _WIDTHS_PX, _QUALITY = (256, 208, 160, 128), 60
 _FAR_QUANTILE = 0.005
 _SEEN_QUANTILE = 0.05
-_FRUSTUM_SHAPE = (0.6, 0.4)
 _RADIUS_OF_95_PERCENT = 2.80
 """Radius, in stddevs, of the sphere that holds 95 % of a three-dimensional normal distribution.
 
@@ -77,10 +76,14 @@ class Scene:
         frame: "site" (z up), or any other name for the frame of a camera (y down).
         paths: of cameras. The last one is the result; the reader chooses cameras on it.
         points_m, points_rgb: (m, 3) positions and colours of the map's points.
-        anchors: by id. Ranges are drawn to those that have a position.
-        content: result whose ranges and photos are shown, too; None: only the map is shown.
-        point_ids: (m,) ids of the points in the model; None if they are not known.
+        anchors: those that have a position, by id.
+        point_ids: (m,) ids of the points in the model; empty if they are not known.
         unit: of all lengths; "m" unless nobody knows the scale.
+        frustum_shape: half the width and half the height of the field of view at unit distance.
+        ranges, errors: data of the ranges, and of how the result errs; empty if these are not known.
+        thumbnails: of photos of the result, by name.
+        scale_interval: ends of the 95 % interval of the scale over its value; empty if it is not known.
+        notes: for the reader, about ranges and photos.
     """
 
     frame: str
@@ -88,19 +91,25 @@ class Scene:
     points_m: Array
     points_rgb: npt.NDArray[np.uint8]
     anchors: Mapping[str, AnchorEntry]
-    content: Content | None = None
-    point_ids: npt.NDArray[np.int64] | None = None
+    point_ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     unit: str = "m"
+    frustum_shape: tuple[float, float] = (0.6, 0.4)
+    ranges: Mapping[str, Any] = field(default_factory=dict)
+    errors: Mapping[str, Any] = field(default_factory=dict)
+    thumbnails: Mapping[str, str] = field(default_factory=dict)
+    scale_interval: Sequence[float] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def result(self) -> Trajectory:
         return self.paths[-1].trajectory
 
 
-def scene_of(content: Content) -> Scene | None:
-    """Return the scene of a result, or None where the result has no model."""
-    if not content.final:
-        return None
+def view_of_result(content: Content) -> dict[str, Any]:
+    """Return the data of the view of a result, as ``view_of`` does; empty where the result has no model."""
+    summary, result = content.summary, content.final
+    if not result:
+        return {}
     paths = []
     if n := len(content.reference_m):
         nowhere = np.tile(np.eye(3), (n, 1, 1))
@@ -112,16 +121,28 @@ def scene_of(content: Content) -> Scene | None:
         paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled, is_shown=is_result))
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
-    summary = content.summary
-    return Scene(
+    anchors = {id_: anchor for id_, anchor in summary.anchors.items() if anchor.position_m is not None}
+    photos, pictures = result.image_names, thumbnails(content.images_path, result.image_names)
+    stride, known = every_nth(len(content.ranges), MAX_NUM_RANGES), f"{count(len(pictures))} of {count(len(photos))}"
+    notes = (
+        f"One in {stride} ranges is drawn and listed; ranges.csv has all." if stride > 1 else "",
+        f"To keep the page small, only {known} photos have a picture here." if 0 < len(pictures) < len(photos) else "",
+    )
+    scene = Scene(
         summary.frame,
         tuple(paths),
         content.points_m,
         content.points_rgb,
-        summary.anchors,
-        content,
+        anchors,
         content.point_ids,
+        frustum_shape=content.cameras[0].half_angles if content.cameras else Scene.frustum_shape,
+        ranges=_ranges(content, result),
+        errors=errors_of_scene(content.result.read_map_errors(), summary, result, list(anchors)),
+        thumbnails=pictures,
+        scale_interval=[end / summary.scale.value for end in summary.scale.interval_95 or ()],
+        notes=notes,
     )
+    return view_of(scene)
 
 
 def view_of(scene: Scene) -> dict[str, Any]:
@@ -142,30 +163,18 @@ def view_of(scene: Scene) -> dict[str, Any]:
     origin_m = step * np.round((low + high) / 2 / step)
     low, high = low - origin_m, high - origin_m
     ground = float(low[2]) if scene.frame == "site" else float(high[1])
-    content, photos = scene.content, scene.result.image_names
-    cameras, scale = (None, None) if content is None else (content.cameras, content.summary.scale)
-    pictures = {} if content is None else thumbnails(content.images_path, photos)
-    points, ranges = _points(scene, origin_m), None if content is None else _ranges(content, scene.result)
-    anchors = [_anchor(id_, anchor, origin_m) for id_, anchor in scene.anchors.items() if anchor.position_m is not None]
+    points, anchors = _points(scene, origin_m), [_anchor(*each, origin_m) for each in scene.anchors.items()]
     layers = [("points", "Map points", "map", "dots", True)] if points else []
     layers += [
         (path.id, path.name, path.color, "line" if path.has_orientations else "dashed", path.is_shown)
         for path in scene.paths
     ]
     layers += [("anchors", "Anchors", "anchor", "triangle", True)] if anchors else []
-    errors = None
-    if content is not None:
-        anchor_ids = [anchor["id"] for anchor in anchors]
-        errors = errors_of_scene(content.result.read_map_errors(), content.summary, scene.result, anchor_ids)
     num_left_out = len(scene.points_m) - (points["num"] if points else 0)
-    stride = 1 if content is None else every_nth(len(content.ranges), MAX_NUM_RANGES)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
         f"{count(num_left_out)} points are not drawn, because they are far away or too many." if num_left_out else "",
-        f"One in {stride} ranges is drawn and listed; ranges.csv has all." if stride > 1 else "",
-        f"To keep the page small, only {count(len(pictures))} of {count(len(photos))} photos have a picture here."
-        if 0 < len(pictures) < len(photos)
-        else "",
+        *scene.notes,
         "Ellipsoids around the anchors are their 95 % regions, at true size." if anchors else "",
     )
     return {
@@ -174,16 +183,16 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "origin": origin_m.tolist(),
         "box": {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground},
         "paths": [_path(path, origin_m) for path in scene.paths],
-        "points": points,
+        "points": points or None,
         "anchors": anchors,
-        "ranges": ranges,
+        "ranges": scene.ranges or None,
         "frustum_size": _frustum_size(scene.result, radius),
-        "frustum_shape": cameras[0].half_angles if cameras else _FRUSTUM_SHAPE,
-        "thumbnails": pictures,
-        "errors": errors,
-        "scale_interval": [end / scale.value for end in scale.interval_95] if scale and scale.interval_95 else None,
+        "frustum_shape": scene.frustum_shape,
+        "thumbnails": scene.thumbnails,
+        "errors": scene.errors or None,
+        "scale_interval": scene.scale_interval or None,
         "layers": [*layers, ("grid", "Grid", "muted", "box", True)],
-        "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
+        "num_photos": len(scene.result) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
 
@@ -202,10 +211,10 @@ def _path(path: ScenePath, origin_m: Array) -> dict[str, Any]:
     }
 
 
-def _points(scene: Scene, origin_m: Array) -> dict[str, Any] | None:
+def _points(scene: Scene, origin_m: Array) -> dict[str, Any]:
     chosen = _chosen_points(scene)
     if len(chosen) == 0:
-        return None
+        return {}
     points = scene.points_m[chosen] - origin_m
     origin, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
     return {
@@ -214,7 +223,7 @@ def _points(scene: Scene, origin_m: Array) -> dict[str, Any] | None:
         "extent": extent,
         "steps": pack(np.round((points - origin) / extent * NUM_STEPS), "uint16"),
         "colors": pack(scene.points_rgb[chosen], "uint8"),
-        "ids": None if scene.point_ids is None else pack(scene.point_ids[chosen], "int32"),
+        "ids": pack(scene.point_ids[chosen], "int32") if len(scene.point_ids) else None,
     }
 
 
@@ -236,7 +245,7 @@ def _chosen_points(scene: Scene) -> npt.NDArray[np.int64]:
 
 def _around(scene: Scene) -> Array:
     """Return the positions of cameras and anchors, (n, 3)."""
-    anchors = [[anchor.position_m] for anchor in scene.anchors.values() if anchor.position_m is not None]
+    anchors = [[anchor.position_m] for anchor in scene.anchors.values()]
     return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
 
 
@@ -259,10 +268,10 @@ def _anchor(anchor_id: str, anchor: AnchorEntry, origin_m: Array) -> dict[str, A
     }
 
 
-def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
+def _ranges(content: Content, path: Trajectory) -> dict[str, Any]:
     ranges = content.ranges
     if not ranges:
-        return None
+        return {}
     rows = np.arange(0, len(ranges.status), every_nth(len(ranges.status), MAX_NUM_RANGES))
     before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
     fraction = np.where(has_place, ranges.weight[rows], 0.0)

@@ -19,13 +19,13 @@ _SHIFT = slice(3, 6)
 
 def errors_of_scene(
     errors: MapErrors | None, summary: ResultSummary, path: Trajectory, anchor_ids: Sequence[str]
-) -> dict[str, Any] | None:
-    """Return how the centres of cameras and the anchors err together, cameras first; None if it is not known.
+) -> dict[str, Any]:
+    """Return how the centres of cameras and the anchors err together, cameras first; empty if it is not known.
 
     It is the same as in MapErrors, with as many modes as the shifts of these points need, and no more.
     """
     if errors is None or not len(path) or summary.scale.interval_95 is None:
-        return None
+        return {}
     found = []
     points: tuple[tuple[Kind, Sequence[int | str], slice], ...] = (
         ("frame", path.frame_ids.tolist(), _SHIFT),
@@ -38,7 +38,7 @@ def errors_of_scene(
                 rows = [parts.row_of[id_] for id_ in ids]
                 found.append((parts.modes[rows, shift], parts.rests[rows, shift, shift], parts.by_scale[rows, shift]))
     except KeyError:  # the model is of another run
-        return None
+        return {}
     modes, rests, by_scale = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     left, sizes, _ = np.linalg.svd(modes.reshape(3 * len(modes), -1), full_matrices=False)
     shifts = left * sizes
