@@ -14,7 +14,8 @@ import pytest
 from tests.conftest import Command, WalkedSurvey
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.kind import Doubt
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations, ScaleUncertainty

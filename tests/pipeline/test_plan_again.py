@@ -56,7 +56,7 @@ def test_the_plan_is_of_the_map_that_the_run_found(
 def test_a_doubtful_survey_is_told_what_its_plan_would_change(
     walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rangesfm.estimation.scale.scale_verdict.DOUBTFUL_ABOVE", 1e-3)
+    monkeypatch.setattr("rangesfm.estimation.scale.scale_estimate.DOUBTFUL_ABOVE", 1e-3)
     flags = (*walked_survey.flags, "--anchor_frame", "unknown", "--use_anchors", "A1", "--no_report")
     printed = rangesfm_command("scale", *flags, "--output_path", tmp_path / "out", cwd=walked_survey.folder).stdout
     scale = json.loads((tmp_path / "out" / "result.json").read_text())["scale"]

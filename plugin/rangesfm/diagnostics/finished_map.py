@@ -17,7 +17,7 @@ from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.measurements.joint_map import Doubt
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape, similarity_motions
@@ -67,7 +67,7 @@ def doubts_of_map(summary: RefineSummary | None, points: PointErrors) -> Iterato
         remedy = "allow more iterations ([refine] max_num_iterations), or remove wrong points from the map"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
     for misfit in () if summary is None else summary.misfits:
-        yield Doubt(f"after the refinement {misfit.reason}", misfit.remedy)
+        yield Doubt(f"after the refinement {misfit.reason}", misfit.advice)
 
 
 def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Doubt, ...]:

@@ -19,7 +19,7 @@ from rangesfm import solver
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.errors import SolverError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR, MEDIAN_FACTOR
-from rangesfm.measurements.joint_map import Doubt
+from rangesfm.measurements.kind import Doubt
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bundle_adjustment import bundle_adjustment, keyframe_centers
 from rangesfm.solver.mistakes import RISK

@@ -13,12 +13,13 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
 from rangesfm.measurements.gravity import UpwardDirection
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
-from rangesfm.measurements.ranges.errors.range_errors import Misfit, RangeErrors, misfits
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, misfits
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.options import CameraOptions, RefineOptions
@@ -142,7 +143,7 @@ class RefineSummary:
     seconds: float
     converged: bool
     message: str
-    misfits: tuple[Misfit, ...]
+    misfits: tuple[Doubt, ...]
     anchors: tuple[AnchorEstimate, ...]
     tags_in_cam_m: Array
     time_shift_s: float | None

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
@@ -41,13 +41,6 @@ if TYPE_CHECKING:
 
     from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides
     from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
-
-
-class Doubt(NamedTuple):
-    """A fault of a map, and what to do about it."""
-
-    reason: str
-    advice: str = ""
 
 
 class Located(ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 Block = tuple[str, str]
 """Name of a parameter besides the poses: what it is, and whose, as ``("anchor", "A1")``."""
+
+
+class Doubt(NamedTuple):
+    """A fault of a map, and what to do about it."""
+
+    reason: str
+    advice: str = ""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
 from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_verdict import refuse_unknown
-from rangesfm.measurements.joint_map import Doubt, JointMap
+from rangesfm.estimation.scale.scale_estimate import refuse_unknown
+from rangesfm.measurements.joint_map import JointMap
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.pipeline.metric_result import MetricResult

@@ -12,8 +12,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_pieces
 from rangesfm.errors import GeometryError, number_text
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
-from rangesfm.measurements.joint_map import Doubt
-from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.kind import Doubt, MapState
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.clock_rivals import by_rivals
 from rangesfm.pipeline.close_loops import close_loops_of_survey

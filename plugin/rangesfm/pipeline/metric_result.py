@@ -14,8 +14,8 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import Place
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, upward_by
-from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
+from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Mask, median, rms
 from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.errors import number_text
-from rangesfm.estimation.scale.scale_diagnostics import scale_diagnostics
+from rangesfm.estimation.scale.scale_estimate import scale_diagnostics
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words

@@ -11,7 +11,7 @@ import numpy as np
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
-from rangesfm.measurements.joint_map import Doubt
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.result_records import disagreements, distance_rows, summary_of, tables_of

@@ -15,7 +15,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.free_fit import GraphBending
-from rangesfm.estimation.scale.scale_verdict import Verdict, judge
+from rangesfm.estimation.scale.scale_estimate import Verdict, judge
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.tape import CHECK
@@ -273,7 +273,7 @@ def _positions(
         if not planned.anchors:
             raise GeometryError(f"the scale is not determined: {error}") from None
         return None, None, (*notes, f"the known positions are not used: {error}")
-    return found, PlacementPrior.with_covariance(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
+    return found, PlacementPrior.with_covariance(planned.site_from_first_camera, alone.placement), notes
 
 
 def _sensor(planned: PlannedSurvey, the_map: _BendingMap) -> tuple[PlannedScale | None, tuple[str, ...]]:

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.anchor_alignment import PlacedAnchor, align_by_anchors
+from rangesfm.estimation.scale.model_placement import PlacedAnchor, align_by_anchors
 from rangesfm.util.geometry.similarity import Similarity
 
 Array = npt.NDArray[np.float64]

@@ -12,7 +12,7 @@ from tests.known import known
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_verdict import Verdict, judge, refuse_unknown
+from rangesfm.estimation.scale.scale_estimate import Verdict, judge, refuse_unknown
 from rangesfm.measurements.lengths.length_scale import lengths_between_points
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.position_scale import doubts_of_positions

@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.scale.scale_verdict import judge_map_of_kinds
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate, judge_map_of_kinds
 from rangesfm.measurements.joint_map import (
     JointMap,
     KindOnMap,
@@ -26,10 +25,9 @@ from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDi
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.range_estimate import NOT_KNOWN, RangeEstimate
 from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
-from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleByKind, ScaleUncertainty

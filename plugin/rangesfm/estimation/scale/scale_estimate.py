@@ -1,25 +1,102 @@
-"""ScaleEstimate: the result of the scale stage."""
+"""ScaleEstimate: the result of the scale stage, with its verdict in a surveyor's words, and tables to plot of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from rangesfm.arrays import Array
-from rangesfm.estimation.scale.scale_verdict import Verdict, judge, judge_map_of_kinds
+from rangesfm.arrays import Array, Indices
+from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
-from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
-from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate, ScaleSensitivity
+from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95, NOTHING_KNOWN, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a scale.
+
+    Attributes:
+        verdict: "good" or "doubtful".
+        reasons: in words.
+        advice: what to do about the faults, in words; what would improve the survey most is part of its plan.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+def judge(
+    doubts: Iterable[Doubt], remarks: Iterable[Doubt], uncertainty: ScaleUncertainty, options: ScaleOptions
+) -> Verdict:
+    """Return the verdict by the 95 % interval, and by faults that make the interval itself doubtful.
+
+    Args:
+        doubts: such faults. remarks: what is to be said without any doubt.
+
+    Raises:
+        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
+    """
+    half_width, doubts = uncertainty.half_width_95, [*doubts]
+    why, advised = [doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts if doubt.advice]
+    refuse_unknown(half_width, why, advised, options)
+    percent = f"{100 * half_width:.1f}" if half_width >= 1e-3 else f"{100 * half_width:.1g}"
+    summary = f"the scale is known to {percent} % (95 % interval)"
+    if half_width > DOUBTFUL_ABOVE:
+        doubts.insert(0, Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %"))
+    said = [*doubts, *remarks]
+    advice = tuple(dict.fromkeys(each.advice for each in said if each.advice))
+    reasons = tuple(each.reason for each in said)
+    if not doubts:
+        return Verdict("good", (summary, *reasons), advice)
+    return Verdict("doubtful", reasons, advice)
+
+
+def judge_map_of_kinds(on_map: JointMap, options: ScaleOptions) -> Verdict:
+    """Return the verdict on a map with all that is measured in it, as ``judge``.
+
+    The first kind that is used says what makes the interval doubtful.
+    """
+    first = next(each for each in on_map.kinds if each.is_used)
+    uncertainty = on_map.posterior.uncertainty
+    remarks = itertools.chain.from_iterable(each.remarks(on_map) for each in on_map.kinds)
+    return judge(first.doubts(uncertainty), remarks, uncertainty, options)
+
+
+def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[str], options: ScaleOptions) -> None:
+    """Raise GeometryError if a scale is less certain than allowed, with the first reason and the first advice.
+
+    Args:
+        half_width: half of the 95 % interval of the scale, relative.
+    """
+    if half_width > NORMAL_95 * options.max_relative_stddev:
+        planned = "plan the survey first (rangesfm plan), to see what would make the scale more certain"
+        if half_width > NORMAL_95 * NOTHING_KNOWN:
+            known = "the scale is not determined"
+        else:
+            allowed = 100 * NORMAL_95 * options.max_relative_stddev
+            known = (
+                f"the scale is only known to {100 * half_width:.1f} % (95 % interval), worse than the {allowed:.3g} % "
+                f"allowed ({NORMAL_95} times max_relative_stddev)"
+            )
+        raise GeometryError(
+            f"{known}{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -169,3 +246,54 @@ class ScaleEstimate:
         """Return the scale with its interval and its verdict on one line."""
         low, high = self.interval_95
         return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"
+
+
+NUM_CURVE_POINTS = 601
+CURVE_FACTOR = 3.0
+"""The curve runs from the scale divided by this factor to the scale times it."""
+
+
+@dataclass(frozen=True)
+class ScaleDiagnostics:
+    """Tables beside a ScaleEstimate; all scales are in metres per SfM unit.
+
+    Attributes:
+        candidate_rows: (k,) rows of the log whose ranges have candidates.
+        candidates: (k, 2) the smaller and the larger candidate of each.
+        curve_scales: (m,) increasing scales.
+        num_agreeing: (m,) number of ranges that agree with each scale.
+    """
+
+    candidate_rows: Indices
+    candidates: Array
+    curve_scales: Array
+    num_agreeing: Indices
+
+
+def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleDiagnostics:
+    """Return the tables of an estimate on its unscaled path, with its anchors and its rotation held fixed."""
+    observations, log, placed = estimate.observations, estimate.observations.log, estimate.metric_from_sfm
+    anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
+    rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
+    tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
+
+    def about(held: Array) -> tuple[Array, Array]:
+        """Return centres in SfM units and anchors in metres, both along the metric axes and relative to a place."""
+        return (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
+
+    # In the paper the first camera is the origin.
+    centers, anchor_m = about(trajectory.centers[0])
+    table = two_candidate(centers, tags, anchor_m, range_m)
+    # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
+    centers, anchor_m = about(trajectory.centers.mean(axis=0) if estimate.frame == "site" else trajectory.centers[0])
+    bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
+    tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
+    starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
+    scales = placed.scale * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
+    num_begun = np.searchsorted(np.sort(starts), scales, side="right")
+    return ScaleDiagnostics(
+        candidate_rows=np.zeros(0, dtype=np.int64) if table is None else rows[table.rows],
+        candidates=np.zeros((0, 2)) if table is None else table.duplets,
+        curve_scales=scales,
+        num_agreeing=np.asarray(num_begun - np.searchsorted(np.sort(ends), scales, side="left")),
+    )

@@ -34,8 +34,8 @@ from rangesfm.measurements.imu.preintegration import (
     Preintegrated,
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
-from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.solver.bending import MapBending

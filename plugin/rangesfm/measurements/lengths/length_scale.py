@@ -12,13 +12,13 @@ from scipy import special
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, number_text
 from rangesfm.measurements.joint_map import (
-    Doubt,
     JointMap,
     KindOnMap,
     fit_kinds,
     in_first_cameras_frame,
     most_contradicting,
 )
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS, lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance

@@ -15,8 +15,8 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask, median, rms
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds, most_contradicting
-from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds, most_contradicting
+from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import LEFT_OUT, Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions

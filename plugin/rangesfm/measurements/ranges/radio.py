@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths.cost import Lengths
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges, antenna_places
@@ -82,21 +82,9 @@ def _between_anchors(ranges: Ranges, points: NamedPoints) -> Lengths:
     )
 
 
-class LengthsByRadio(NamedTuple):
-    """Lengths between k pairs of anchors.
-
-    Attributes:
-        anchor_pair: (k, 2) indices of the two anchors. distance_m, stddev_m: (k,) length and its standard deviation.
-    """
-
-    anchor_pair: Indices
-    distance_m: Array
-    stddev_m: Array
-
-
 def lengths_by_radio(
     log: RangeLog, noise_m: float, bias_m: Array, bias_stddev_m: Array, common_bias_stddev_m: float
-) -> LengthsByRadio:
+) -> LocatedDistances:
     """Return one length for each pair of anchors that ranged: the median of their ranges in both directions.
 
     All ranges of a pair share the error from the same delays and reflections, so that many are hardly better than one.
@@ -120,7 +108,7 @@ def lengths_by_radio(
     variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
     variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2
     corrected_m = medians - (bias_m[first] + bias_m[second]) / 2
-    return LengthsByRadio(pairs.reshape(-1, 2), corrected_m, np.sqrt(variance))
+    return LocatedDistances.between_anchors(corrected_m, np.sqrt(variance), pairs.reshape(-1, 2))
 
 
 def ranges_of(kinds: Sequence[Measurements], given: Ranges) -> Ranges:

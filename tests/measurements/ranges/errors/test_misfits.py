@@ -30,7 +30,7 @@ def test_a_stretch_that_is_off_is_told() -> None:
     residuals[300:360] += 1.0
     (reason,) = misfits(make_errors(0.1), residuals, np.arange(3.0 * NUM_EACH))
     assert "in 3 of 60 short periods" in reason.reason
-    assert reason.remedy == "check clocks, lever arm and anchors"
+    assert reason.advice == "check clocks, lever arm and anchors"
 
 
 def test_one_stretch_of_many_in_which_somebody_stood_between_is_no_misfit() -> None:
@@ -44,7 +44,7 @@ def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it()
     errors = make_errors(loss=CAUCHY).seen_by_bending_map(noise((0.1, 0.1, 0.1)) + drift, 0.0)
     reasons = misfits(errors, noise((0.1, 0.1, 0.1)) + drift, np.arange(3.0 * NUM_EACH))
     (reason,) = (misfit for misfit in reasons if "far more than they scatter" in misfit.reason)
-    assert reason.remedy == "check clocks, lever arm and anchors"
+    assert reason.advice == "check clocks, lever arm and anchors"
 
 
 def test_photos_too_far_apart_are_told_where_ranges_fit_only_near_them() -> None:
@@ -54,7 +54,7 @@ def test_photos_too_far_apart_are_told_where_ranges_fit_only_near_them() -> None
     reasons = misfits(errors, noise((0.02, 0.02, 0.02)) + 0.5 * between, np.arange(3.0 * NUM_EACH))
     (reason,) = (misfit for misfit in reasons if "far more than they scatter" in misfit.reason)
     assert reason.reason.endswith("the photos are too far apart")
-    assert "use more of the photos" in reason.remedy
+    assert "use more of the photos" in reason.advice
 
 
 def apart(num: int, stddev_m: float = 1.0) -> RangeErrors:

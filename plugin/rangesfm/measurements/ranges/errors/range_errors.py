@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import (
     MIN_NOISE_M,
@@ -44,6 +45,7 @@ _MIN_SCATTER_M = 0.01
 # If the residuals of this share of the ranges, those nearest to the photos, are smaller than all by this factor, the
 # path between the photos is the reason.
 _NEAREST, _AT_PHOTOS = 0.2, 0.5
+_CHECK = "check clocks, lever arm and anchors"
 _MORE_PHOTOS = (
     "use more of the photos (every_nth, min_interval_s), or only ranges that are near to one (max_interpolation_gap_s)"
 )
@@ -309,14 +311,7 @@ def fit_with_own_errors(
     return fitted, errors, seen
 
 
-class Misfit(NamedTuple):
-    """Why ranges fit a map worse than their noise suggests, and what to do about it."""
-
-    reason: str
-    remedy: str = "check clocks, lever arm and anchors"
-
-
-def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[Misfit, ...]:
+def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[Doubt, ...]:
     """Return reasons why the ranges fit worse than their noise suggests; empty if they do not.
 
     Args:
@@ -329,7 +324,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     typical = robust_stddev(stated)
     if len(stated) >= MIN_NUM_OF_SCATTER and typical > SIGNIFICANT_STDDEVS:
         told = f"the ranges typically miss the map by {typical:.1f} times their standard deviation"
-        reasons.append(Misfit(told))
+        reasons.append(Doubt(told, _CHECK))
     off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > SIGNIFICANT_STDDEVS))
     if num_off > _FEW_BLOCKS * len(off):
@@ -337,7 +332,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
             f"in {num_off} of {len(off)} short periods all ranges to one anchor miss the map on the same side, by more "
             "than their noise explains"
         )
-        reasons.append(Misfit(told))
+        reasons.append(Doubt(told, _CHECK))
     order = np.lexsort((time_order, errors.anchor_index))
     steps, is_of_one = np.diff(residuals_m[order]), np.diff(errors.anchor_index[order]) == 0
     steps = steps[is_of_one & ((steps != 0) | (np.diff(time_order[order]) != 0))]  # a range that a log has twice is one
@@ -350,7 +345,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
             at_photos_m = robust_stddev(residuals_m[errors.placing_m <= np.quantile(errors.placing_m, _NEAREST)])
             if at_photos_m < _AT_PHOTOS * size:
                 told += f", but not those nearest to the photos ({at_photos_m:.2f} m): the photos are too far apart"
-                reasons.append(Misfit(told, _MORE_PHOTOS))
+                reasons.append(Doubt(told, _MORE_PHOTOS))
             else:
-                reasons.append(Misfit(told))
+                reasons.append(Doubt(told, _CHECK))
     return tuple(reasons)

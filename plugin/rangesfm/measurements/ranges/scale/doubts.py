@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rangesfm.measurements.joint_map import Doubt
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.scale.range_equation import RangeFit

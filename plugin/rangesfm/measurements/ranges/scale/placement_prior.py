@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.util.geometry.rotations import cross_matrices, left_jacobians
+from rangesfm.util.geometry.rotations import left_jacobians
 from rangesfm.util.geometry.similarity import Similarity
 
 
@@ -18,27 +18,24 @@ class PlacementPrior:
 
     Attributes:
         mean: site_from_model.
-        middle: (3,) point of the model about which the covariance is.
-        whitening: (7, 7) of the errors of the logarithm of the scale, a turn and a shift of that point.
+        whitening: (7, 7) of the errors of the logarithm of the scale, a turn and a shift about the model's origin.
     """
 
     mean: Similarity
-    middle: Array
     whitening: Array
 
     @classmethod
-    def with_covariance(cls, mean: Similarity, middle: Array, covariance: Array) -> PlacementPrior:
+    def with_covariance(cls, mean: Similarity, covariance: Array) -> PlacementPrior:
         """Return the prior with this (7, 7) covariance."""
-        return cls(mean, middle, np.linalg.inv(np.linalg.cholesky(covariance)))
+        return cls(mean, np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def _turn(self, similarity: Similarity) -> Array:
+        return np.asarray(Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T).as_rotvec())
 
     def residuals(self, similarity: Similarity) -> Array:
         """Return the residuals (7,) of a similarity, in standard deviations."""
-        return np.asarray(self.whitening @ self._off(similarity))
-
-    def _off(self, similarity: Similarity) -> Array:
-        turn = Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T).as_rotvec()
-        shift = similarity.apply(self.middle[None])[0] - self.mean.apply(self.middle[None])[0]
-        return np.array([np.log(similarity.scale / self.mean.scale), *turn, *shift])
+        log_scale, shift = np.log(similarity.scale / self.mean.scale), similarity.translation - self.mean.translation
+        return np.asarray(self.whitening @ np.array([log_scale, *self._turn(similarity), *shift]))
 
     def jacobian(self, similarity: Similarity, left: Array) -> Array:
         """Return the (7, 7) derivatives of the residuals by the logarithm of the scale, a turn and a translation.
@@ -46,12 +43,6 @@ class PlacementPrior:
         Args:
             left: (3, 3) left Jacobian of the rotation vector, as in ``Gravity.jacobian``.
         """
-        grown = similarity.scale * similarity.rotation @ self.middle
-        own = left_jacobians(Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T).as_rotvec())
-        slopes = np.zeros((7, 7))
-        slopes[0, 0] = 1.0
-        slopes[1:4, 1:4] = np.linalg.inv(own) @ left
-        slopes[4:, 0] = grown
-        slopes[4:, 1:4] = -cross_matrices(grown[None])[0] @ left
-        slopes[4:, 4:] = np.eye(3)
+        slopes = np.eye(7)
+        slopes[1:4, 1:4] = np.linalg.inv(left_jacobians(self._turn(similarity))) @ left
         return np.asarray(self.whitening @ slopes)

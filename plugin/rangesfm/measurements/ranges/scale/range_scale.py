@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.joint_map import BentMap, Doubt, JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
@@ -18,7 +19,6 @@ from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
-from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
 from rangesfm.measurements.ranges.scale.doubts import (
     doubts_of_ranges,
@@ -27,10 +27,14 @@ from rangesfm.measurements.ranges.scale.doubts import (
     remarks_on_places,
 )
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, predicted_ranges, solve
-from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.range_estimate import (
+    RangeEstimate,
+    anchor_estimates,
+    scale_per_anchor,
+    scale_sensitivity,
+)
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.sensitivity import scale_sensitivity
 from rangesfm.measurements.ranges.scale.solution import Solution, with_unknown_anchors
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending

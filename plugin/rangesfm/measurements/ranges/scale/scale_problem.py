@@ -188,8 +188,7 @@ def scale_problem(
     if anchor_frame == "site" and not known.any():
         measured += _between_surveyed(in_log, surveyed & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
-    pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
-    measured.append(LocatedDistances.between_anchors(length_m, stddev_m, pairs))
+    measured.append(lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], given.trajectory),
