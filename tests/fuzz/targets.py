@@ -145,7 +145,7 @@ def _read_whole_result(path: Path) -> ResultFolder:
     summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.in_words  # noqa: B018
     result.anchor_positions_m, result.images_path, result.lever_arms_m(["T1"])
     _expect(summary.georeference is None or summary.georeference.georeference.crs, "a coordinate system")
-    _expect(list(summary.lines(path.parent, None)), "lines for people")
+    _expect(list(summary.lines(path.parent)), "lines for people")
     summary.write(path.with_name("again.json"))
     _expect(ResultSummary.read(path.with_name("again.json")) == summary, "a result that is read as it was written")
     return result

@@ -13,7 +13,8 @@ from tests.result_document import REFINE, anchor_entry, result_document
 
 from rangesfm.comparison.with_reference import format_table
 from rangesfm.errors import InputError, number_text
-from rangesfm.result.entries import AnchorEntry, ComparisonRow
+from rangesfm.result.comparison_row import ComparisonRow
+from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.summary import ResultSummary, schema
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def test_the_accuracy_is_told_for_ten_metres(interval_95: list[float] | None, wo
     assert summary.scale.in_words == words
     assert words in repr(summary)
     assert len(repr(summary)) < 100
-    assert any(words in line for line in summary.lines(Path("out"), None)) == (interval_95 is not None)
+    assert any(words in line for line in summary.lines(Path("out"))) == (interval_95 is not None)
 
 
 def test_a_number_that_rounds_to_zero_has_no_sign() -> None:
@@ -158,20 +159,20 @@ def test_a_doubtful_place_always_has_its_reason() -> None:
     for reasons, said in (((doubt, wide), wide), ((doubt,), "for the same reasons as the scale")):
         scale = {"verdict": "doubtful", "reasons": [doubt]}
         document = result_document(scale=scale, place={**place, "reasons": list(reasons)})
-        lines = ResultSummary.model_validate(document).lines(Path("out"), None)
+        lines = ResultSummary.model_validate(document).lines(Path("out"))
         assert f"place: doubtful: {said}" in list(lines)
 
 
 def test_loops_and_unnoticed_mistakes_are_told_in_sentences() -> None:
     loops = {"num_proposed": 309, "num_verified": 60, "num_closed": 15, "num_contradicted": 2, "moved_m": 0.021}
     bound = {"scale_within": 0.077, "risk": 1e-4, "limited_by": "lever arm", "unchecked": []}
-    lines = list(ResultSummary.model_validate(result_document(loops=loops, reliability=bound)).lines(Path("out"), None))
+    lines = list(ResultSummary.model_validate(result_document(loops=loops, reliability=bound)).lines(Path("out")))
     assert (
         "loops: the map suggests that 309 pairs of photos show the same place; 60 of them match; 15 were used to close "
         "loops, which moved the map by 0.021 m (rms); 2 contradict the measurements and were not used"
     ) in lines
     agreeing = result_document(loops={**loops, "num_closed": 0, "num_contradicted": 0})
-    lines += ResultSummary.model_validate(agreeing).lines(Path("out"), None)
+    lines += ResultSummary.model_validate(agreeing).lines(Path("out"))
     assert any(line.endswith("60 of them match; the map agrees with these as it is") for line in lines)
     assert (
         "reliability: if one mistake was made and not noticed, the scale is off by 7.7 % at most (risk of more: "

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
-from rangesfm.result.entries import ComparisonRow, rmse_heading
+from rangesfm.result.comparison_row import ComparisonRow, rmse_heading
 from rangesfm.util.files.text_tables import align_rows
 from rangesfm.util.geometry.reference import Reference
 from rangesfm.util.geometry.similarity import Similarity, align_points, rmse, similarity_between
@@ -43,7 +43,28 @@ def compare(
     Raises:
         InputError: the reference has no keyframe of a path.
     """
-    return tuple(_compare_path(name, path, reference, frame) for name, path in paths.items())
+    rows = []
+    for name, path in paths.items():
+        known, target, world_from_cam = known_keyframes(path, reference)
+        if len(known) == 0:
+            raise InputError(reference.why_nothing_is_known("keyframes", reference.keys_of(path)))
+        source = path.centers[known]
+        in_frame = _in_frame(path, known, target, world_from_cam, frame)
+        found = similarity_onto(source, target)
+        aligned_m: list[float | None] = [None, None]
+        if len(source) >= MIN_NUM_ALIGNED:
+            alignments = [align_points(source, target, with_scale=with_scale) for with_scale in (False, True)]
+            aligned_m = [rmse(each.apply(source) - target) for each in alignments]
+        row = ComparisonRow(
+            name=name,
+            num_keyframes=len(source),
+            rmse_m=None if in_frame is None else rmse(source - in_frame),
+            rmse_se3_m=aligned_m[0],
+            rmse_sim3_m=aligned_m[1],
+            scale_error_percent=None if found is None else 100.0 * (1.0 / found.scale - 1.0),
+        )
+        rows.append(row)
+    return tuple(rows)
 
 
 def papers_table(
@@ -104,27 +125,6 @@ def _in_frame(
         return None
     path_from_reference = path.world_from_cam[known[0]] @ world_from_cam[0].T
     return np.asarray((positions - positions[0]) @ path_from_reference.T + path.centers[known[0]])
-
-
-def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str | None) -> ComparisonRow:
-    known, target, world_from_cam = known_keyframes(path, reference)
-    if len(known) == 0:
-        raise InputError(reference.why_nothing_is_known("keyframes", reference.keys_of(path)))
-    source = path.centers[known]
-    in_frame = _in_frame(path, known, target, world_from_cam, frame)
-    found = similarity_onto(source, target)
-    aligned_m: list[float | None] = [None, None]
-    if len(source) >= MIN_NUM_ALIGNED:
-        alignments = [align_points(source, target, with_scale=with_scale) for with_scale in (False, True)]
-        aligned_m = [rmse(each.apply(source) - target) for each in alignments]
-    return ComparisonRow(
-        name=name,
-        num_keyframes=len(source),
-        rmse_m=None if in_frame is None else rmse(source - in_frame),
-        rmse_se3_m=aligned_m[0],
-        rmse_sim3_m=aligned_m[1],
-        scale_error_percent=None if found is None else 100.0 * (1.0 / found.scale - 1.0),
-    )
 
 
 def similarity_onto(source: Array, target: Array) -> Similarity | None:

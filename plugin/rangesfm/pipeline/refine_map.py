@@ -41,11 +41,10 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
     Raises:
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
-    run = _with_open_clock(run, metric)
+    run, model_path = _with_open_clock(run, metric), run.survey.images.model
+    is_refined = model_path is not None and is_refined_model(model_path)
     with at_most(run.survey.mapper.num_threads):
-        return _finished(
-            run, metric, refine(_problem(run, metric, is_refined=is_refined_model(run.survey.images.model)))
-        )
+        return _finished(run, metric, refine(_problem(run, metric, is_refined=is_refined)))
 
 
 def refine_closed_map(

@@ -17,7 +17,7 @@ from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.result_records import disagreements, distance_rows, summary_of, tables_of
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
-from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.result.joint_covariance import write_map_errors
 from rangesfm.result.places import recorded_path, recorded_settings
 from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
@@ -89,7 +89,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             with journal.stage("report"):
                 content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
                 write_report_of(content, staged)
-    lines = [*summary.lines(folder, format_table(comparison, summary.frame) if comparison else None)]
+    lines = [*summary.lines(folder, format_table(comparison, summary.frame) if comparison else "")]
     if survey.report.enabled:
         lines.append(f"report: {folder / REPORT_NAME}")
     if not_exported is not None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -141,12 +142,12 @@ def _axis(field: str, limits: Range, axis: Spec | None) -> Spec:
     return {"field": field, "type": "quantitative", "scale": scale, "axis": axis, "stack": None}
 
 
-def _layer(kind: str, rows: list[Spec], encoding: Spec | None = None, **mark: Any) -> Spec:
+def _layer(kind: str, rows: list[Spec], encoding: Mapping[str, Any] = MappingProxyType({}), **mark: Any) -> Spec:
     """Return a layer of a panel.
 
     It is clipped to the panel, because zooming moves marks out of it. The encoding of x and y is that of the panel.
     """
-    return {"data": {"values": rows}, "mark": {"type": kind, "clip": True, **mark}, "encoding": encoding or {}}
+    return {"data": {"values": rows}, "mark": {"type": kind, "clip": True, **mark}, "encoding": {**encoding}}
 
 
 def _background(panel: Panel, x_range: Range, y_range: Range) -> list[Spec]:

@@ -19,7 +19,8 @@ from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.facts import frame_in_words
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
-from rangesfm.result.entries import AnchorEntry, rmse_heading
+from rangesfm.result.comparison_row import rmse_heading
+from rangesfm.result.entries import AnchorEntry
 from rangesfm.survey.settings import KEYS
 from rangesfm.util.files.folders import natural_order
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -277,14 +278,7 @@ def distances(content: Content) -> ReportTable:
 
 def positions_used(content: Content) -> ReportTable:
     """Return the table of the positions of an antenna: how many are used, and how they fit."""
-    given = content.summary.positions
-    values = {} if given is None else given.to_json()
-    rows = [
-        [_POSITIONS[name], keyed(f"positions.{name}", value, plain(value))]
-        for name, value in values.items()
-        if value is not None
-    ]
-    return ReportTable("Positions of the antenna", [], rows, is_narrow=True)
+    return _listed("Positions of the antenna", content, "positions", _POSITIONS)
 
 
 def control_points(content: Content) -> ReportTable:
@@ -342,14 +336,7 @@ def stages(content: Content) -> ReportTable:
 
 def refinement(content: Content) -> ReportTable:
     """Return the table of what the refinement did."""
-    refine = content.summary.refine
-    values = {} if refine is None else refine.to_json()
-    rows = [
-        [words, keyed(f"refine.{name}", values[name], plain(values[name]))]
-        for name, words in _REFINEMENT.items()
-        if values.get(name) not in (None, "", {}, [])
-    ]
-    return ReportTable("Refinement", [], rows, is_narrow=True)
+    return _listed("Refinement", content, "refine", _REFINEMENT)
 
 
 def error_budget(content: Content) -> ReportTable:
@@ -405,6 +392,15 @@ def settings(content: Content) -> ReportTable:
     known = [item for item in KEYS if (given.get(item.table) or {}).get(item.name) not in (None, [], {})]
     rows = [[item.meaning, plain(given[item.table][item.name]), f"[{item.table}] {item.name}"] for item in known]
     return ReportTable("Settings", ["meaning", "value", "key of the survey file"], rows, kind="settings")
+
+
+def _listed(caption: str, content: Content, key: str, words: Mapping[str, str]) -> ReportTable:
+    """Return the table of the known values of an entry of ``result.json``, each with its words."""
+    entry = getattr(content.summary, key)
+    values = {} if entry is None else entry.to_json()
+    known = {name: values[name] for name in words if values.get(name) not in (None, "", {}, [])}
+    rows = [[words[name], keyed(f"{key}.{name}", value, plain(value))] for name, value in known.items()]
+    return ReportTable(caption, [], rows, is_narrow=True)
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:

@@ -257,14 +257,13 @@ def _frustum_size(path: Trajectory, radius: float) -> float:
 
 
 def _anchor(anchor_id: str, anchor: AnchorEntry, origin_m: Array) -> dict[str, Any]:
-    def relative(position_m: Sequence[float] | None) -> list[float] | None:
-        return None if position_m is None else np.subtract(position_m, origin_m).tolist()
-
+    places = {"position": anchor.position_m, "mirror": anchor.mirror_position_m}
+    at = {name: None if place is None else np.subtract(place, origin_m).tolist() for name, place in places.items()}
     return {
         "id": anchor_id,
-        "position": relative(anchor.position_m),
+        "position": at["position"],
         "ellipsoid": [_RADIUS_OF_95_PERCENT * anchor.stddev_m] * 3 if anchor.stddev_m else None,
-        "mirror": relative(anchor.mirror_position_m),
+        "mirror": at["mirror"],
     }
 
 

@@ -52,7 +52,7 @@ def input_beside(folder: Path, recorded: str) -> Path | None:
     root of the file system.
     """
     path, around = path_in(folder, recorded), real_path(folder).parent
-    own = folder if around in (Path(around.anchor), _home()) else around
+    own = folder if around == Path(around.anchor) or _is_home(around) else around
     return path if is_within(path, own) else None
 
 
@@ -65,8 +65,8 @@ def is_within(path: Path, folder: Path) -> bool:
     return not end.is_symlink() and end.is_relative_to(real_path(folder))  # links in a circle remain a link
 
 
-def _home() -> Path | None:
+def _is_home(path: Path) -> bool:
     try:
-        return real_path(Path.home())
+        return path == real_path(Path.home())
     except RuntimeError:  # this user has no home folder
-        return None
+        return False

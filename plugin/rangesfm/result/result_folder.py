@@ -139,10 +139,10 @@ class ResultFolder:
         return self.read_model("sparse_metric") or self.read_model("sparse_scaled")
 
 
-def is_refined_model(path: Path | None) -> bool:
+def is_refined_model(path: Path) -> bool:
     """Return whether a model's folder is that of a result whose map was refined with ranges."""
-    stage = None if path is None else path.resolve().parent
-    if stage is None or stage.name != "sparse_metric":
+    stage = path.resolve().parent
+    if stage.name != "sparse_metric":
         return False
     try:
         refine = read_result_folder(stage.parent).summary.refine

@@ -18,6 +18,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import number_text
 from rangesfm.result import entries
+from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.util.files.records import NumberOrNull, Record, Text
 from rangesfm.util.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -71,7 +72,7 @@ class ResultSummary(Record):
     positions: entries.PositionsEntry | None = None
     points: entries.PointsEntry | None = None
     imu: entries.ImuEntry | None = None
-    comparison: tuple[entries.ComparisonRow, ...] = ()
+    comparison: tuple[ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
     settings: entries.Settings
@@ -101,12 +102,12 @@ class ResultSummary(Record):
         gravity = gravity_of(self.settings.to_json().get("scale", {}).get("up_in_first_camera"))
         return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
-    def lines(self, folder: Path, table: str | None) -> Iterator[str]:
+    def lines(self, folder: Path, table: str = "") -> Iterator[str]:
         """Yield the lines that the user sees at the end of a run.
 
         Args:
             folder: of the result.
-            table: of the comparison with a reference, as text; None without one.
+            table: of the comparison with a reference, as text.
         """
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
         interval = "no interval"
@@ -155,7 +156,7 @@ class ResultSummary(Record):
             value, within = _text(offset.value_s, "+.3f"), _text(within_s, ".3f")
             yield f"time offset: image time = range time {value} s, within {within} s (95 %)"
         yield f"map: {self.map.num_photos} photos, {self.map.num_points3D} points, frame {self.frame}"
-        if table is not None:
+        if table:
             yield from ("", *table.splitlines(), "")
         yield f"metric model: {folder / ('sparse_scaled/0' if self.refine is None else 'sparse_metric/0')}"
         yield f"all results: {folder / self.NAME}"
