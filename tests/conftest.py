@@ -185,7 +185,7 @@ def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
     )
     radio = Radio(rate_hz=rate_hz, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
     write_model(made.reconstruction, folder / "sparse" / "0", made.timestamps_s, folder / "images.csv")
-    write_ranges_csv(simulate_ranges(path, _AROUND_WALK_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
+    write_ranges_csv(simulate_ranges(path, _AROUND_WALK_M, TAG_IN_CAM_M, radio, seed=5), folder / "uwb.csv")
     write_anchors(folder / "anchors.csv", ANCHORS_M)
     in_first_camera = (np.array(list(_AROUND_WALK_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
     write_anchors(folder / "anchors_first_camera.csv", dict(zip(ANCHORS_M, in_first_camera, strict=True)))

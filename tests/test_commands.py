@@ -706,7 +706,7 @@ def test_photos_and_a_log_that_names_them_need_no_times(
     radio = Radio(range_stddev_m=0.02)
     measured = simulate_ranges_at(
         survey.timestamps_s, survey.centers_m, survey.world_from_cam, ANCHORS_M, TAG_IN_CAM_M, radio, seed=1
-    ).log
+    )
     names = np.repeat(survey.image_names, len(ANCHORS_M)).tolist()
     log = RangeLog.from_arrays(measured.end_ids()[1], measured.range_m, image_name=names)
     write_ranges_csv(log, tmp_path / "uwb.csv")

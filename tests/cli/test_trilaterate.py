@@ -36,7 +36,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a flight: ``uwb.csv``, and its positions as ``flight.csv`` (camera) and ``tag.csv`` (tag)."""
     path = loop_path(40.0, height_amplitude_m=1.5, seed=3)
     radio = Radio(rate_hz=4.0, range_stddev_m=0.03, obstructed_share=0.1, time_offset_s=TIME_OFFSET_S)
-    write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5).log, tmp_path / "uwb.csv")
+    write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5), tmp_path / "uwb.csv")
     times = np.arange(0.0, 40.0, 0.1)
     centers, turns = path.centers(times), path.world_from_cam(times)
     write_reference(Reference(centers, timestamps_s=times, world_from_cam=turns), tmp_path / "flight.csv")

@@ -77,7 +77,7 @@ def test_colmap_guesses_the_focal_length_from_exif_within_two_percent(made: Demo
 def test_log_is_on_the_radios_clock_and_covers_all_photos(made: DemoSurvey) -> None:
     log = read_ranges(made.folder / "uwb.csv")
     assert set(log.anchor_ids) == set(ANCHORS_M)
-    np.testing.assert_array_equal(log.range_m, made.ranges.log.range_m)
+    np.testing.assert_array_equal(log.range_m, made.ranges.range_m)
     times = np.asarray(log.timestamp_s) + TIME_OFFSET_S
     assert times.min() < made.timestamps_s[0] - 1
     assert times.max() > made.timestamps_s[-1] + 1

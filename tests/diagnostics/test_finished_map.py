@@ -92,7 +92,7 @@ def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) ->
     squares, rng = [], np.random.default_rng(0)
     for seed in range(6):
         walked = make_survey(num_epochs=4, radio=RADIO, seed=seed)
-        log = walked.simulated.log
+        log = walked.log
         # The biases are drawn with the stddevs that the range model assumes.
         bias_m = COMMON_BIAS_STDDEV_M * rng.standard_normal() + 0.01 * rng.standard_normal(len(log.anchor_ids))
         log = walked.log_with(log.range_m + bias_m[log.anchor_index])

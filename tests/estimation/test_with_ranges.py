@@ -138,9 +138,9 @@ def make_survey(
     if at_keyframes:
         each = np.repeat(np.arange(num_keyframes), num_epochs)
         centers, rotations = model.centers_m[each], model.world_from_cam[each]
-        simulated = simulate_ranges_at(times[each], centers, rotations, anchors_m, TAG_IN_CAM_M, radio, seed)
+        log = simulate_ranges_at(times[each], centers, rotations, anchors_m, TAG_IN_CAM_M, radio, seed)
     else:
-        simulated = simulate_ranges(path, anchors_m, TAG_IN_CAM_M, radio, seed)
+        log = simulate_ranges(path, anchors_m, TAG_IN_CAM_M, radio, seed)
     trajectory = trajectory_from_reconstruction(model.reconstruction, model.timestamps_s)
     first_camera = Similarity(1.0, model.world_from_cam[0], model.centers_m[0])
     from_world = IDENTITY if frame == "site" else first_camera.inverse()
@@ -148,7 +148,7 @@ def make_survey(
         model.reconstruction,
         model.timestamps_s,
         trajectory,
-        associate(simulated.log, trajectory, TAG_IN_CAM_M),
+        associate(log, trajectory, TAG_IN_CAM_M),
         frame,
         from_world @ model.metric_from_sfm,
         from_world.apply(model.centers_m),

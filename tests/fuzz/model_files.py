@@ -57,7 +57,7 @@ def make_survey(folder: Path) -> None:
     made.reconstruction.write_binary(folder / "binary")
     made.reconstruction.write_text(folder / "text")
     radio = Radio(rate_hz=2.0, range_stddev_m=0.05)
-    write_ranges_csv(simulate_ranges(path, anchors_m, _TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
+    write_ranges_csv(simulate_ranges(path, anchors_m, _TAG_IN_CAM_M, radio, seed=5), folder / "uwb.csv")
     rows = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(rows))
     rows = [f"{name},{x},{y},{z}\n" for name, (x, y, z) in anchors_m.items()]

@@ -123,7 +123,7 @@ def walk() -> Halves:
         times, path.centers(times), path.world_from_cam(times), num_observations=30, max_track_length=8, seed=1
     )
     at = np.repeat(times, 2)
-    log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), ANCHORS_M, TAG_IN_CAM_M, Radio(), 5).log
+    log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), ANCHORS_M, TAG_IN_CAM_M, Radio(), 5)
     names, rng, parts = list(made.timestamps_s), np.random.default_rng(0), []
     for number, others in enumerate((names[HALF:], names[:HALF])):
         model = rescale(without_photos(made.reconstruction, others), random_similarity(rng))
@@ -206,7 +206,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     models = tuple(part.sfm for part in exact.parts)
 
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
-        return ReconstructionSummary(models, len(names), HALF, {}, {}, tmp_path / "mapper.log")
+        return ReconstructionSummary(models, {}, {}, tmp_path / "mapper.log")
 
     monkeypatch.setattr("rangesfm.pipeline.map_photos.reconstruct_in", reconstruct)
     survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})

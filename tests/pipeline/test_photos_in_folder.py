@@ -76,7 +76,7 @@ def test_a_check_tells_of_a_bag_and_takes_nothing_out(survey: Survey) -> None:
 def write_demo_as_bag(demo: DemoSurvey, folder: Path) -> None:
     """Write a bag with camera and radio, anchors named by the radio's numbers, and the truth by time."""
     folder.mkdir()
-    log = demo.ranges.log
+    log = demo.ranges
     assert log.timestamp_s is not None
     messages: list[Message] = []
     for time_s, anchor_id, range_m in zip(

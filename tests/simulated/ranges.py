@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.demo.simulated_radio import Radio, SimulatedRanges, measure_ranges
+from rangesfm.demo.simulated_radio import Radio, measure_ranges
+from rangesfm.measurements.ranges.range_log import RangeLog
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -20,7 +21,7 @@ def simulate_ranges_at(
     tag_in_cam_m: Sequence[float] | FloatArray,
     radio: Radio,
     seed: int = 0,
-) -> SimulatedRanges:
+) -> RangeLog:
     """Simulate one range to each anchor at each of m given poses; the radio's rate is not used.
 
     Args:

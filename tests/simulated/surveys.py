@@ -342,7 +342,7 @@ def range_log(truth: Truth, seed: int, *, biases_m: Array | None = None, num_eac
     at = np.repeat(np.arange(len(times)), num_each)
     return simulate_ranges_at(
         times[at], model.centers_m[at], model.world_from_cam[at], truth.anchors_m, TAG_IN_CAM_M, radio, seed
-    ).log
+    )
 
 
 def errors_in(

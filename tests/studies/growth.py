@@ -126,7 +126,7 @@ def write_ranges(folder: Path, made: SyntheticModel, num_each: int, rng: np.rand
     times = np.array(list(made.timestamps_s.values()))[keyframe]
     biases = dict(zip(anchors, (0.03 * rng.standard_normal(len(grid))).tolist()))
     radio = Radio(range_stddev_m=0.1, range_bias_m=biases)
-    write_ranges_csv(measure_ranges(times, tags[keyframe], anchor, anchors, radio, seed=1).log, folder / "uwb.csv")
+    write_ranges_csv(measure_ranges(times, tags[keyframe], anchor, anchors, radio, seed=1), folder / "uwb.csv")
     rows = [f"{name},{x!r},{y!r},{z!r}\n" for name, (x, y, z) in zip(anchors, grid.tolist())]
     (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
 

@@ -87,7 +87,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
     positions = np.column_stack([1.1 * axis * np.cos(angles), 0.85 * axis * np.sin(angles), heights])
     anchors = {f"A{i}": position for i, position in enumerate(positions)}
     radio = Radio(rate_hz=2.0, range_stddev_m=0.1)
-    write_ranges_csv(simulate_ranges(path, anchors, TAG_IN_CAM_M, radio, seed=seed).log, folder / "uwb.csv")
+    write_ranges_csv(simulate_ranges(path, anchors, TAG_IN_CAM_M, radio, seed=seed), folder / "uwb.csv")
     rows = [f"{name},{x!r},{y!r},{z!r}\n" for name, (x, y, z) in zip(anchors, positions.tolist())]
     (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
     rows = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]

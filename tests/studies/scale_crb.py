@@ -126,7 +126,7 @@ def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
     trajectory = trajectory_from_reconstruction(sfm, model.timestamps_s)
     keyframe = range_keyframes(case, model)
     biases = np.random.default_rng([seed, 2]).multivariate_normal(np.zeros(len(case.anchors_m)), bias_covariance(case))
-    simulated = simulate_ranges_at(
+    log = simulate_ranges_at(
         np.array(list(model.timestamps_s.values()))[keyframe],
         model.centers_m[keyframe],
         model.world_from_cam[keyframe],
@@ -139,7 +139,7 @@ def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
     if case.anchor_frame != "site":
         frame_from_world = Similarity(1.0, model.world_from_cam[0], model.centers_m[0]).inverse()
     estimate = initialize_scale(
-        associate(simulated.log, trajectory, TAG_IN_CAM_M),
+        associate(log, trajectory, TAG_IN_CAM_M),
         trajectory,
         [Anchor(name, frame_from_world.apply(np.array(position))) for name, position in case.anchors_m.items()],
         anchor_frame=case.anchor_frame,

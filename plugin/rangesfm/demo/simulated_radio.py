@@ -80,30 +80,14 @@ class Radio:
     resolution_m: float = 0.0
 
 
-@dataclass(frozen=True)
-class SimulatedRanges:
-    """n simulated ranges with their true values, in the order of the log.
-
-    Attributes:
-        image_time_s: (n,) time of each range on the camera's clock.
-        distance_m: (n,) true distance between the antennas.
-        is_obstructed: (n,) whether a range had no line of sight.
-    """
-
-    log: RangeLog
-    image_time_s: Array
-    distance_m: Array
-    is_obstructed: npt.NDArray[np.bool_]
-
-
 def simulate_ranges(
     path: CameraPath,
     anchors_m: Mapping[str, Sequence[float] | Array],
     tag_in_cam_m: Sequence[float] | Array,
     radio: Radio,
     seed: int = 0,
-) -> SimulatedRanges:
-    """Simulate ranges at the radio's rate along a whole path.
+) -> RangeLog:
+    """Simulate ranges at the radio's rate along a whole path; the log has the times of the radio's clock.
 
     Args:
         anchors_m: position (3,) of each anchor in the world, by id, metres.
@@ -123,7 +107,7 @@ def measure_ranges(
     anchors_m: Mapping[str, Sequence[float] | Array],
     radio: Radio,
     seed: int,
-) -> SimulatedRanges:
+) -> RangeLog:
     """Simulate the radio's measurement of n distances; the radio's rate is not used.
 
     Args:
@@ -144,7 +128,6 @@ def measure_ranges(
         ranges = np.round(radio.resolution_m * np.rint(ranges / radio.resolution_m), 12)
     ranges = np.maximum(ranges, max(_MIN_RANGE_M, radio.resolution_m))
     arrived = rng.random(len(times_s)) >= radio.lost_share
-    log = RangeLog.from_arrays(
+    return RangeLog.from_arrays(
         ids[anchor_index[arrived]], ranges[arrived], timestamp_s=times_s[arrived] - radio.time_offset_s
     )
-    return SimulatedRanges(log, times_s[arrived], distances[arrived], is_obstructed[arrived])

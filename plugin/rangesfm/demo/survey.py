@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.demo.simulated_imu import PHONE, imu_table, simulate_imu
-from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.errors import InputError
 from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
 from rangesfm.util.files.output_folder import PRIVATE_NAME
@@ -70,7 +71,7 @@ _EXPECTED = "expected a new or an empty folder, or one that holds the same demo"
 
 @dataclass(frozen=True)
 class DemoSurvey:
-    """The demo survey, with its true poses and ranges.
+    """The demo survey, with its true poses.
 
     Attributes:
         folder: holds ``survey.toml``, ``images``, ``uwb.csv``, ``anchors.csv`` and ``reference.csv``, and ``imu.csv``
@@ -79,7 +80,7 @@ class DemoSurvey:
         timestamps_s: (n,) times on the camera's clock, seconds since 1970.
         centers_m: (n, 3) projection centres in the site frame, metres.
         world_from_cam: (n, 3, 3) rotations.
-        ranges: the log, on the radio's clock, with its true values.
+        ranges: the log, on the radio's clock.
         imu: the log of an inertial sensor, on its clock; None without one.
     """
 
@@ -88,7 +89,7 @@ class DemoSurvey:
     timestamps_s: Array
     centers_m: Array
     world_from_cam: Array
-    ranges: SimulatedRanges
+    ranges: RangeLog
     imu: ImuLog | None = None
 
     @property
@@ -153,7 +154,7 @@ def write_demo(
         with new_folder(folder / "images") as images:
             for number, name in enumerate(survey.image_names):
                 take_photo(number, images / name)
-        write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
+        write_ranges_csv(survey.ranges, folder / "uwb.csv")
         write_reference(reference, folder / "reference.csv")
         for name, text in files.items():
             write_text(text, folder / name)

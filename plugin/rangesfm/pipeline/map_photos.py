@@ -268,7 +268,7 @@ def map_keyframes(
             else:
                 unpublished.publish([output.path / name for name in RESULT_NAMES])
     journal.seconds.update({**summary.earlier_seconds, **summary.seconds})
-    if summary.num_registered < summary.num_keyframes:
+    if summary.num_registered < len(photos):
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
-        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+        journal.warn(f"{summary.num_registered} of {len(photos)} keyframes are in {which}")
     return summary.models

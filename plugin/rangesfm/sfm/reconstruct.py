@@ -30,19 +30,20 @@ class ReconstructionSummary:
 
     Attributes:
         models: the separate models, the one with the most photos first.
-        num_keyframes: photos asked for.
-        num_registered: photos in the first model.
         seconds: duration of each step ("features", "matching", "mapping"), without those taken over from earlier runs.
         earlier_seconds: of those taken over, as far as known.
         log_path: COLMAP's own log.
     """
 
     models: tuple[pycolmap.Reconstruction, ...]
-    num_keyframes: int
-    num_registered: int
     seconds: dict[str, float]
     earlier_seconds: dict[str, float]
     log_path: Path
+
+    @property
+    def num_registered(self) -> int:
+        """Number of photos in the first model."""
+        return self.models[0].num_reg_images()
 
 
 def reconstruct(
@@ -139,14 +140,7 @@ def reconstruct_in(
     if len(found) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in found)
         progress.message(f"{len(found)} separate models of {sizes} photos")
-    return ReconstructionSummary(
-        found,
-        len(image_names),
-        found[0].num_reg_images(),
-        space.seconds,
-        space.earlier_seconds,
-        unpublished.log_path,
-    )
+    return ReconstructionSummary(found, space.seconds, space.earlier_seconds, unpublished.log_path)
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions, log_folder: Path) -> None:

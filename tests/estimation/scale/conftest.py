@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.simulated_radio import Radio, SimulatedRanges
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
@@ -47,7 +47,7 @@ class Survey:
         times, centers_m, world_from_cam: the true path in the site frame.
         anchors_m: true positions in the site frame.
         tag_in_cam_m: lever arm.
-        simulated: ranges and the truth about them.
+        log: the ranges, at the times of the keyframes.
     """
 
     trajectory: Trajectory
@@ -57,7 +57,16 @@ class Survey:
     world_from_cam: Array
     anchors_m: dict[str, Array]
     tag_in_cam_m: Array
-    simulated: SimulatedRanges
+    log: RangeLog
+
+    @property
+    def distance_m(self) -> Array:
+        """The true distance of each range in the log."""
+        assert self.log.timestamp_s is not None
+        keyframe = np.searchsorted(self.times, self.log.timestamp_s)
+        anchors = np.array([self.anchors_m[name] for name in self.log.anchor_ids])[self.log.anchor_index]
+        tags = self.centers_m[keyframe] + self.world_from_cam[keyframe] @ self.tag_in_cam_m
+        return np.asarray(np.linalg.norm(tags - anchors, axis=1))
 
     def frame_from_site(self, frame: str) -> Similarity:
         """Return the transform from the site to a frame, "site" or "first_camera"."""
@@ -74,7 +83,7 @@ class Survey:
         return [Anchor(name, from_site.apply(at) if name in known else None) for name, at in self.anchors_m.items()]
 
     def observations(self, log: RangeLog | None = None) -> RangeObservations:
-        return associate(log or self.simulated.log, self.trajectory, self.tag_in_cam_m)
+        return associate(log or self.log, self.trajectory, self.tag_in_cam_m)
 
     def scale(
         self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
@@ -87,7 +96,7 @@ class Survey:
 
     def log_with(self, range_m: Array) -> RangeLog:
         """Return the same log with other ranges."""
-        return replace(self.simulated.log, range_m=range_m)
+        return replace(self.log, range_m=range_m)
 
     def relative_error(self, estimate: ScaleEstimate) -> float:
         return estimate.value / self.site_from_sfm.scale - 1

@@ -56,7 +56,7 @@ def test_interpolated_ranges_give_a_far_better_scale_than_those_at_photos_alone(
     for seed in range(10):
         path = loop_path(60.0, seed=seed)
         trajectory = unscaled(path, np.arange(0.0, 60.0))
-        log = simulate_ranges(path, positions, TAG_IN_CAM_M, Radio(10.0, RANGE_STDDEV_M), seed).log
+        log = simulate_ranges(path, positions, TAG_IN_CAM_M, Radio(10.0, RANGE_STDDEV_M), seed)
         anchors = [Anchor(name, in_first_camera(path, 0.0, position)) for name, position in positions.items()]
         found = associate(log, trajectory, TAG_IN_CAM_M)
         assert log.timestamp_s is not None

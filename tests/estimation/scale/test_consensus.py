@@ -85,7 +85,7 @@ def test_local_maxima_are_those_found_by_counting_at_every_place() -> None:
 def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, seed: int) -> None:
     survey = make_survey(scale=3.0, radio=Radio(range_stddev_m=STDDEV_M), seed=seed)
     rng = np.random.default_rng(seed)
-    ranges = survey.simulated.log.range_m
+    ranges = survey.log.range_m
     wild = rng.random(len(ranges)) < 0.6
     best = consensus_scales(known_anchors(survey, np.where(wild, rng.uniform(0.5, 20.0, len(ranges)), ranges)))[0]
     assert best == pytest.approx(survey.site_from_sfm.scale, rel=0.03)

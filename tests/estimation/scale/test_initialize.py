@@ -147,7 +147,7 @@ class TestWithOutliers:
         survey = make_survey(radio=radio)
         estimate = survey.scale("first_camera", "ABCDE")
         status = estimate.observations.status
-        too_long = survey.simulated.log.range_m - survey.simulated.distance_m
+        too_long = survey.log.range_m - survey.distance_m
         assert np.all(status[too_long > 2.0] == RangeStatus.OUTLIER)
         assert np.mean(status[np.abs(too_long) < 0.1] == RangeStatus.USED) > 0.99
         # By Geman-McClure's loss, far outliers pull by the inverse cube of their size; by Cauchy's, by the inverse.
@@ -321,7 +321,7 @@ class TestOpenButNotFatal:
 
     def test_an_unknown_anchor_with_hardly_any_ranges_is_left_out_and_named(self, make_survey: MakeSurvey) -> None:
         survey = make_survey()
-        log = survey.simulated.log
+        log = survey.log
         of_e = np.flatnonzero(log.anchor_index == log.anchor_ids.index("E"))
         keep = np.setdiff1d(np.arange(len(log)), of_e[3:])
         ids = [log.anchor_ids[k] for k in log.anchor_index[keep]]
@@ -350,7 +350,7 @@ class TestBias:
 
 def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=Radio(range_stddev_m=0.1, obstructed_share=0.2), num_epochs=2)
-    log = survey.simulated.log
+    log = survey.log
     order = np.random.default_rng(0).permutation(len(log))
     assert log.timestamp_s is not None
     shuffled = RangeLog.from_arrays(
@@ -367,7 +367,7 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
     survey = make_survey(radio=NOISE, num_epochs=2)
     held_out = hold_out(survey.observations(), RangesOptions(check_share=0.2), seed=0)
     is_check = held_out.status == RangeStatus.CHECK
-    spoilt = survey.observations(survey.log_with(np.where(is_check, 1.0, survey.simulated.log.range_m)))
+    spoilt = survey.observations(survey.log_with(np.where(is_check, 1.0, survey.log.range_m)))
     spoilt.status[is_check] = RangeStatus.CHECK
     anchors = survey.anchors("first_camera", "ABCDE")
     first, second = (
@@ -397,7 +397,7 @@ def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances
 
 def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=THREE_ANCHORS_M, radio=NOISE, num_epochs=2)
-    long = survey.log_with(survey.simulated.log.range_m * 1.04)
+    long = survey.log_with(survey.log.range_m * 1.04)
     truth = survey.truth("first_camera").scale
     alone = survey.scale("unknown", log=long)
     held = survey.scale("unknown", log=long, distances=between_cameras(survey))
@@ -426,7 +426,7 @@ def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wr
 
 def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE)
-    log = survey.log_with(survey.simulated.log.range_m + 0.3)
+    log = survey.log_with(survey.log.range_m + 0.3)
     truth = survey.frame_from_site("first_camera").apply(np.array(list(survey.anchors_m.values())))
 
     def spread_m(estimate: ScaleEstimate) -> float:
@@ -442,7 +442,7 @@ def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(m
 
 def test_ranges_between_anchors_of_the_log_do_so_too(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE)
-    log, ids = survey.log_with(survey.simulated.log.range_m + 0.3), list(survey.anchors_m)
+    log, ids = survey.log_with(survey.log.range_m + 0.3), list(survey.anchors_m)
     pairs = list(itertools.combinations(ids, 2))
     lengths = pdist(np.array(list(survey.anchors_m.values())))
     assert log.timestamp_s is not None
@@ -476,7 +476,7 @@ def test_the_noise_is_found_from_the_ranges_themselves(make_survey: MakeSurvey) 
 
 def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE)
-    log = survey.simulated.log
+    log = survey.log
     stated = RangeLog.from_arrays(
         [log.anchor_ids[k] for k in log.anchor_index],
         log.range_m,

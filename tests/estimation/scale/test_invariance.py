@@ -64,7 +64,7 @@ def test_the_origin_of_the_map_may_be_10_000_km_away(survey: Survey, origin: tup
 def test_the_order_of_ranges_and_anchors_does_not_matter(survey: Survey, frame: str) -> None:
     rng = np.random.default_rng(0)
     expected = estimate(survey, frame)
-    log = survey.simulated.log.subset(rng.permutation(len(survey.simulated.log)))
+    log = survey.log.subset(rng.permutation(len(survey.log)))
     assert_same(estimate(survey, frame, log=log), expected)
     positions = list(survey.anchors_m.items())
     turned = replace(survey, anchors_m=dict(reversed(positions)))
@@ -84,7 +84,7 @@ def test_the_same_input_gives_the_same_bits(survey: Survey) -> None:
 def test_a_tag_exactly_on_an_anchor_does_no_harm(make_survey: MakeSurvey, survey: Survey) -> None:
     tag_m = survey.centers_m[5] + survey.world_from_cam[5] @ survey.tag_in_cam_m
     on_it = make_survey(num_keyframes=20, anchors_m={"A": tuple(tag_m), "B": (6.0, 0.0, 2.5)})
-    log = on_it.log_with(np.maximum(on_it.simulated.distance_m, 1e-9))
+    log = on_it.log_with(np.maximum(on_it.distance_m, 1e-9))
     found = on_it.scale("first_camera", ("A", "B"), log)
     assert on_it.relative_error(found) == pytest.approx(0, abs=1e-6)
 
@@ -93,12 +93,12 @@ def test_a_tag_exactly_on_an_anchor_does_no_harm(make_survey: MakeSurvey, survey
 @pytest.mark.parametrize("range_m", [1e-300, 5.0, 1e6])
 def test_ranges_that_are_all_alike_are_refused(survey: Survey, frame: str, range_m: float) -> None:
     with pytest.raises(GeometryError, match="no range changed"):
-        estimate(survey, frame, log=survey.log_with(np.full(len(survey.simulated.log), range_m)))
+        estimate(survey, frame, log=survey.log_with(np.full(len(survey.log), range_m)))
 
 
 def test_ranges_that_are_all_alike_are_refused_where_the_first_camera_has_a_place(survey: Survey) -> None:
     with pytest.raises(GeometryError, match="the scale is not determined: ranges and photos leave the shape"):
-        estimate(survey, log=survey.log_with(np.full(len(survey.simulated.log), 1e6)))
+        estimate(survey, log=survey.log_with(np.full(len(survey.log), 1e6)))
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def scale_of(kind: str, share: float, seed: int) -> float:
     walk = loop_path(60.0, height_amplitude_m=0.6, unsteadiness_m=0.1, start_deg=360 * rng.random(), seed=seed)
     centers_m, world_from_cam = walk.centers(times), walk.world_from_cam(times)
     radio, anchors = Radio(range_stddev_m=0.1), {"A": ANCHOR_M}
-    log = simulate_ranges_at(times, centers_m, world_from_cam, anchors, TAG_IN_CAM_M, radio, seed).log
+    log = simulate_ranges_at(times, centers_m, world_from_cam, anchors, TAG_IN_CAM_M, radio, seed)
     log = RangeLog.from_arrays(["A"] * NUM_RANGES, spoilt(log.range_m, kind, share, rng), timestamp_s=times)
     cam_from_world = world_from_cam[0].T
     centers = (centers_m - centers_m[0]) @ cam_from_world.T / SCALE

@@ -89,7 +89,7 @@ def test_a_straight_path_leaves_the_roll_of_a_map_in_the_site_uncertain(make_sur
 
 def test_an_anchor_that_is_hardly_heard_is_named(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE, num_epochs=3)
-    log = survey.simulated.log
+    log = survey.log
     rows = np.flatnonzero((log.anchor_index != 4) | (np.cumsum(log.anchor_index == 4) <= 3))
     estimate = survey.scale("first_camera", "ABCD", log.subset(rows))
     assert "anchor E has too few ranges on the path to be placed: left out" in estimate.reasons
@@ -139,8 +139,8 @@ def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:
 def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSurvey) -> None:
     centers = 0.4 * make_survey(num_keyframes=100).centers_m
     survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.03), num_epochs=10)
-    true = survey.simulated.distance_m
-    noise = survey.simulated.log.range_m - true
+    true = survey.distance_m
+    noise = survey.log.range_m - true
     short_m, off = [], []
     for error in (0 * true, -0.4 * np.exp(-true / 1.0)):
         estimate = survey.scale("unknown", (), survey.log_with(true + noise + error))

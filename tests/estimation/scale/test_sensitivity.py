@@ -22,8 +22,8 @@ FAR_ANCHORS_M = {"A": (9.0, 2.0, 2.5), "B": (-9.0, 1.0, 0.4), "C": (0.5, 9.0, 3.
 def test_biases_and_a_slope_change_the_scale_as_said(make_survey: MakeSurvey, frame: str) -> None:
     survey = make_survey(anchors_m=FAR_ANCHORS_M, num_epochs=2)
     base = survey.scale(frame, "ABCD", range_model=HELD)
-    of_a = survey.simulated.log.anchor_index == 0
-    true = survey.simulated.distance_m
+    of_a = survey.log.anchor_index == 0
+    true = survey.distance_m
     cases = {
         base.sensitivity.common_bias_per_cm: np.full(len(true), 0.01),
         base.sensitivity.anchor_bias_per_cm["A"]: 0.01 * of_a,
@@ -41,7 +41,7 @@ def test_a_lever_arm_that_is_wrong_changes_the_scale_as_said(make_survey: MakeSu
     for axis in range(3):
         # The tag sits a centimetre further out than the survey says.
         said = survey.tag_in_cam_m - 0.01 * np.eye(3)[axis]
-        observations = associate(survey.simulated.log, survey.trajectory, said)
+        observations = associate(survey.log, survey.trajectory, said)
         anchors = survey.anchors("first_camera", "ABCD")
         wrong = initialize_scale(
             observations, survey.trajectory, anchors, anchor_frame="first_camera", range_model=HELD

@@ -41,7 +41,7 @@ class Rigid:
 
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
     """(n,) errors of each anchor that come and go over some seconds."""
-    log = survey.simulated.log
+    log = survey.log
     assert log.timestamp_s is not None
     rng = np.random.default_rng(seed)
     errors = np.zeros(len(log))
@@ -76,7 +76,7 @@ def test_with_errors_that_last_the_stddev_grows_and_is_the_scatter(make_survey: 
     errors, formals, seen = [], [], []
     for seed in range(20):
         survey = make_survey(anchors_m=FAR_ANCHORS_M, num_keyframes=100, seed=seed)
-        log = survey.log_with(survey.simulated.distance_m + drifting_errors(survey, 0.1, 4.0, seed))
+        log = survey.log_with(survey.distance_m + drifting_errors(survey, 0.1, 4.0, seed))
         estimate = survey.scale("first_camera", "ABCD", log, range_model=WITHOUT_BIASES)
         errors.append(survey.relative_error(estimate))
         formals.append(estimate.uncertainty.formal)
@@ -106,7 +106,7 @@ def test_four_times_the_ranges_halve_what_is_noise(make_survey: MakeSurvey) -> N
 
 def test_an_error_curve_that_nobody_knows_widens_the_interval_and_a_known_one_hardly(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=Radio(range_stddev_m=0.03), num_epochs=5)
-    log = survey.simulated.log
+    log = survey.log
     calibrated = replace(log, shared_stddev_m=np.full(len(log), 0.005))
     unknown, known = (survey.scale("unknown", (), each).uncertainty for each in (log, calibrated))
     assert known.components["curve"] < 0.7 * unknown.components["curve"]
@@ -142,7 +142,7 @@ def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: Make
     anchors = survey.anchors("site", survey.anchors_m)
 
     def estimate(time_offset_s: float, stddev_s: float) -> ScaleEstimate:
-        placed = associate(survey.simulated.log, survey.trajectory, survey.tag_in_cam_m, time_offset_s=time_offset_s)
+        placed = associate(survey.log, survey.trajectory, survey.tag_in_cam_m, time_offset_s=time_offset_s)
         placed = replace(placed, time_offset_stddev_s=stddev_s)
         return initialize_scale(placed, survey.trajectory, anchors, anchor_frame="site")
 

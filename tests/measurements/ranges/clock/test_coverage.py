@@ -48,7 +48,7 @@ def log_of(path: CameraPath, num_anchors: int, seed: int) -> RangeLog:
     positions = rng.uniform([-5, -5, 0], [5, 5, 2.5], (num_anchors, 3))
     anchors = {f"A{number}": position for number, position in enumerate(positions)}
     radio = Radio(rate_hz=5, range_stddev_m=0.06, obstructed_share=0.1, obstructed_mean_m=0.7, time_offset_s=OFFSET_S)
-    log = simulate_ranges(path, anchors, TAG_IN_CAM_M, radio, seed).log
+    log = simulate_ranges(path, anchors, TAG_IN_CAM_M, radio, seed)
     assert log.timestamp_s is not None
     slow = np.zeros(len(log))
     for anchor in range(num_anchors):

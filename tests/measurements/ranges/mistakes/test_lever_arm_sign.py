@@ -29,7 +29,7 @@ def test_the_sign_of_a_short_lever_arm_is_found_though_no_other_test_sees_it(
     )
     (tmp_path / "sparse").mkdir()
     made.reconstruction.write(tmp_path / "sparse")
-    write_ranges_csv(walk.ranges.log, tmp_path / "uwb.csv")
+    write_ranges_csv(walk.ranges, tmp_path / "uwb.csv")
     (tmp_path / "anchors.csv").write_text(demo._anchor_file(seed))
     rows = "".join(f"{name},{time!r}\n" for name, time in made.timestamps_s.items())
     (tmp_path / "images.csv").write_text(f"image_name,timestamp_s\n{rows}")
