@@ -149,7 +149,7 @@ def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
     if options.frame == "result" and not options.origin_anchor:
         return []
     if options.frame == "enu" and not options.origin_anchor:
-        return ["up is perpendicular to the ellipsoid, by the anchors' coordinates"]
+        return ["up is perpendicular to the ellipsoid, by the site's coordinates"]
     from rangesfm.result.result_folder import read_result_folder
 
     summary = read_result_folder(result_folder).summary
