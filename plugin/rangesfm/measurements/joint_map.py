@@ -22,15 +22,8 @@ from rangesfm.measurements.points import MapToFit
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
-from rangesfm.solver.posterior import (
-    MAX_NUM_OBSERVATIONS,
-    JointProblem,
-    Observations,
-    Posterior,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity

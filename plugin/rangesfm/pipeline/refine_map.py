@@ -23,7 +23,7 @@ from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, 
 from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map, ranges_in_map
 from rangesfm.survey.survey_run import SurveyRun

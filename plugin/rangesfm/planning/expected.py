@@ -35,15 +35,8 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_sensor import PlannedScale
 from rangesfm.solver.bending import BENDS, MapBending, WalkBending
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
-from rangesfm.solver.posterior import (
-    MAX_NUM_OBSERVATIONS,
-    JointProblem,
-    Observations,
-    Posterior,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component, noise_of_sizes, usual_sizes
+from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import similarity_motions
 from rangesfm.util.geometry.trajectory import in_first_camera

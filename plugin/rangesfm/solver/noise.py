@@ -21,6 +21,10 @@ _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 8.0
 _Noise = TypeVar("_Noise", bound="Noise")
 
 
+MAX_NUM_OBSERVATIONS = 450
+"""Largest number of observations of a map: learning their errors takes some twenty inversions of their covariance."""
+
+
 @dataclass(frozen=True)
 class Component:
     """One component of the errors of c observations, before its size is learnt.

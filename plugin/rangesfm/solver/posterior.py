@@ -19,8 +19,6 @@ from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, reg
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 
-MAX_NUM_OBSERVATIONS = 450
-"""Largest number of observations of a map: learning their errors takes some twenty inversions of their covariance."""
 GIVEN = "given"
 """Effect of priors; not a component of the noise."""
 

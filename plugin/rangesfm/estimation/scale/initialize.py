@@ -30,7 +30,8 @@ from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleByKind, ScaleUncertainty
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import with_one_blas_thread

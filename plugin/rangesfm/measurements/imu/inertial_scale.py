@@ -41,15 +41,8 @@ from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.mistakes import MistakeTests
-from rangesfm.solver.noise import Component
-from rangesfm.solver.posterior import (
-    MAX_NUM_OBSERVATIONS,
-    JointProblem,
-    Observations,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component
+from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity

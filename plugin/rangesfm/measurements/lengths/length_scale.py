@@ -25,14 +25,8 @@ from rangesfm.measurements.lengths.tape import TapedDistance
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests, finite
-from rangesfm.solver.posterior import (
-    MAX_NUM_OBSERVATIONS,
-    JointProblem,
-    Observations,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity, path_shape
 from rangesfm.util.geometry.trajectory import Trajectory

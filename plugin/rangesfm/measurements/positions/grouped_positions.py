@@ -19,8 +19,8 @@ from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.noise import Component, independent_unknowns
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, Observations
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component, independent_unknowns
+from rangesfm.solver.posterior import Observations
 from rangesfm.util.geometry.similarity import Similarity, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 

@@ -39,7 +39,8 @@ from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.solver.mistakes import MistakeTests
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleByKind, ScaleUncertainty
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape

@@ -15,7 +15,8 @@ from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import BENDS
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, Observations, Posterior
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import Observations, Posterior
 
 RANGES = "ranges"
 

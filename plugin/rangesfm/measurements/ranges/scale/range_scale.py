@@ -38,7 +38,8 @@ from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution, with_unknown_anchors
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleByKind, ScaleUncertainty
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.posterior import JointProblem, Posterior, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from
