@@ -14,7 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.map_points import MapPoint, MapPoints
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
-from rangesfm.measurements.positions.position_tests import LOOK_AGAIN
+from rangesfm.measurements.positions.known_positions import LOOK_AGAIN
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.util.geometry.map_errors import MapErrors

@@ -48,10 +48,10 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     refinement = None if metric.kept is None else metric.kept.summary
     doubts += doubts_of_map(refinement, point_errors(metric.final))
     advice = "let the offset be searched for ([positions] time_offset)"
-    doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
+    doubts += [Doubt(reason, advice) for reason in metric.inputs.positions.doubts_of_clock()]
     # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
-    of_clocks = (*metric.positions.doubts_of_found_clock(), *metric.rivals.doubts)
+    of_clocks = (*metric.inputs.positions.doubts_of_found_clock(), *metric.rivals.doubts)
     journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *of_clocks)
     doubts += known_doubts
     of_map = [doubt.reason for doubt in doubts]
@@ -89,10 +89,10 @@ def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: A
             except np.linalg.LinAlgError as error:
                 run.journal.warn(f"mistakes were not tested, because the {each.words} determine too little: {error}")
         if is_placing and estimate.placement is not None and any(each.is_solved for each in kinds):
-            by_antenna = metric.positions.antenna is not None and len(kinds) > 1
+            by_antenna = metric.inputs.positions.antenna is not None and len(kinds) > 1
             placed = Placed(estimate.placement, centers_m[0], float(bent_by_m.max(initial=0.0)), by_antenna=by_antenna)
             stddev = estimate.uncertainty.empirical
-            of_points = diagnose_points(metric.positions.points, metric.final, metric.map_errors, stddev, placed)
+            of_points = diagnose_points(metric.inputs.positions.points, metric.final, metric.map_errors, stddev, placed)
             diagnosis = diagnosis.with_more(of_points)
     return diagnosis
 

@@ -91,9 +91,8 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     ranges = ranges_in_map(inputs, estimate, path.trajectory, survey.refine)
     predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
-    kept = without_contradicted(inputs, estimate.kinds)
-    rivals = by_rivals(run, path, estimate)
-    return MetricResult(path, estimate, scaled, predicted, weights, kept.tape, kept.positions, rivals)
+    kept, rivals = without_contradicted(inputs, estimate.kinds), by_rivals(run, path, estimate)
+    return MetricResult(path, kept, estimate, scaled, predicted, weights, rivals)
 
 
 def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:

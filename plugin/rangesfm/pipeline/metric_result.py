@@ -16,13 +16,12 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.measurements.kind import Doubt, Measurements
-from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.sfm.loops.loop_closure import LoopClosure
+from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import Similarity
@@ -89,12 +88,11 @@ class MetricResult:
 
     Attributes:
         path: the unscaled model with its path and the ranges on it.
+        inputs: what was measured, without what contradicts all else in the map.
         estimate: of the scale.
         scaled: the model after rescaling.
         predicted_scaled_m: (n,) ranges predicted by the scaled model; NaN for ranges without a place on the path.
         scaled_weights: (n,) robust weights by the scaled model.
-        tape: the measured lengths, with those left out that cannot be in the map; empty without any.
-        positions: the known positions, with those left out that contradict the others.
         rivals: other likely time offsets.
         refined: the map after the refinement; None without one.
         place: how well the place of the map in the site frame is known; None where the frame is that of the first
@@ -104,12 +102,11 @@ class MetricResult:
     """
 
     path: PathOfModel
+    inputs: RangingInputs
     estimate: ScaleEstimate
     scaled: pycolmap.Reconstruction
     predicted_scaled_m: Array
     scaled_weights: Array
-    tape: Tape
-    positions: SurveyedPositions
     rivals: Rivals
     refined: RefinedMap | None = None
     place: Place | None = None
@@ -216,7 +213,7 @@ class MetricResult:
             self,
             estimate=moved.with_anchors(_moved_anchors(estimate.anchors, offset_m)),
             scaled=rescale(self.scaled, shift),
-            positions=self.positions.moved(offset_m),
+            inputs=replace(self.inputs, positions=self.inputs.positions.moved(offset_m)),
             refined=refined,
         )
 

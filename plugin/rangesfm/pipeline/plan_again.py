@@ -23,7 +23,6 @@ from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
-from rangesfm.survey.inputs import RangingInputs
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 
@@ -72,7 +71,7 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     return _levelled(planned, colored_points(model)[0], len(used), upward)
 
 
-def with_advice(metric: MetricResult, inputs: RangingInputs) -> MetricResult:
+def with_advice(metric: MetricResult) -> MetricResult:
     """Add advice on what to change next time, where the scale or the place is doubtful."""
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
     if metric.estimate.method == "two-candidate":  # another survey would not make its scale more certain
@@ -90,12 +89,12 @@ def with_advice(metric: MetricResult, inputs: RangingInputs) -> MetricResult:
     ]
     is_known = any(anchor.prior_position_m is not None for anchor in metric.anchors)
     trajectory = metric.trajectory.as_in(metric.final)
-    arm = inputs.tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
+    arm = metric.inputs.tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
     try:
         frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
         stddevs = {} if learned is None else learned.stddev_of_component
         points_m = colored_points(metric.final)[0]
-        site = Site(georeference=inputs.site.georeference)
+        site = Site(georeference=metric.inputs.site.georeference)
         learnt = metric.all_measured.problem.sizes
         noise = learnt.get("gyro_noise"), learnt.get("accel_noise")
         sensor = PlannedSensor(gyro_noise=noise[0], accel_noise=noise[1]) if all(noise) else None

@@ -24,7 +24,6 @@ from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
-from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map, ranges_in_map
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
@@ -75,18 +74,13 @@ def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
     return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
 
 
-def _inputs(run: SurveyRun, metric: MetricResult) -> RangingInputs:
-    """Return the inputs without those that contradict all else."""
-    return replace(run.inputs, tape=metric.tape, positions=metric.positions)
-
-
 def _problem(run: SurveyRun, metric: MetricResult, *, is_refined: bool) -> MapProblem:
     """Return the problem of a copy of the map and all that was measured of it."""
     survey, path, model = run.survey, metric.trajectory, pycolmap.Reconstruction(metric.final)
     estimate = metric.estimate.with_anchors(metric.anchors)
     return map_problem(
         model,
-        measured_in_map(_inputs(run, metric), survey, estimate, path, model),
+        measured_in_map(metric.inputs, survey, estimate, path, model),
         path,
         camera=survey.camera,
         options=survey.refine,
@@ -115,7 +109,7 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             )
     model, path = rest.problem.metric, metric.trajectory
     model.update_point_3d_errors()
-    given = ranges_in_map(run.inputs, metric.estimate.with_anchors(metric.anchors), path, options)
+    given = ranges_in_map(metric.inputs, metric.estimate.with_anchors(metric.anchors), path, options)
     summary = summarize(rest, given, covariance, factor)
     broken = why_broken(metric.scaled, model, path, metric.estimate, summary, options.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
@@ -189,7 +183,7 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> 
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
     of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, before, rest)
-    located, _ = kinds_in_map(_inputs(run, metric), of_model)
+    located, _ = kinds_in_map(metric.inputs, of_model)
     others = tested_kinds(
         [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
     )

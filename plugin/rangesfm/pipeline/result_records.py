@@ -19,7 +19,7 @@ from rangesfm.estimation.scale.scale_estimate import scale_diagnostics
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
-from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.positions.control_points import locate_points
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
 from rangesfm.pipeline.metric_result import MetricResult, ModelVerdict
@@ -196,7 +196,7 @@ def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
 
 def points_entry(found: MetricResult) -> entries.PointsEntry | None:
     """Return control and check points in the final map; None without any, or where the map is not in the site."""
-    known = found.positions.points
+    known = found.inputs.positions.points
     if not known.points or found.estimate.frame != "site":
         return None
     located = locate_points(known, found.final, found.trajectory.as_in(found.final))
@@ -229,9 +229,9 @@ def _rmse(rows: Sequence[entries.PointRow], kind: str) -> entries.PointErrors3d:
 
 def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
     """Return a row for each measured length, in the order of its file; empty without any."""
-    if not found.tape.distances:
+    if not found.inputs.tape.distances:
         return []
-    located = locate_distances(found.tape, found.final, [anchor.anchor_id for anchor in found.anchors])
+    located = locate_distances(found.inputs.tape, found.final, [anchor.anchor_id for anchor in found.anchors])
     lengths_m = located.lengths_m(1.0, np.array([anchor.position_m for anchor in found.anchors]).reshape(-1, 3))
     return [
         entries.DistanceRow(
@@ -243,7 +243,7 @@ def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
             estimated_m=length_m,
             residual_m=length_m - taped.distance_m,
         )
-        for taped, length_m in zip(found.tape.distances, lengths_m.tolist(), strict=True)
+        for taped, length_m in zip(found.inputs.tape.distances, lengths_m.tolist(), strict=True)
     ]
 
 
@@ -282,7 +282,7 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
     if (offset := found.path.time_offset) is not None and not offset.is_given:
         yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs_m)
-    markers = found.tape.found_markers
+    markers = found.inputs.tape.found_markers
     if markers:
         names = [name for name, marker in markers.items() for _ in marker.image_names]
         photos = [name for marker in markers.values() for name in marker.image_names]

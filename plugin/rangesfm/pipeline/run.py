@@ -221,5 +221,5 @@ def _imu_on_path(run: SurveyRun, path: PathOfModel) -> InertialSensor | None:
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
     """Add advice for the next survey to a map, compare it with the reference, and write all results."""
     with run.journal.stage("advice"):
-        advised = with_advice(made, run.inputs)
+        advised = with_advice(made)
     return write_results(run, advised)

@@ -19,7 +19,8 @@ from rangesfm.estimation.scale.scale_estimate import Verdict, judge
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.tape import CHECK
-from rangesfm.measurements.positions.position_scale import doubts_of_positions, planned_positions, refuse_open_turn
+from rangesfm.measurements.positions.position_fit import fit_to_map
+from rangesfm.measurements.positions.position_scale import doubts_of_positions, refuse_open_turn
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -38,7 +39,7 @@ from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component, noise_of_sizes, usual_sizes
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
-from rangesfm.util.geometry.similarity import similarity_motions
+from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.util.geometry.trajectory import in_first_camera
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
@@ -258,7 +259,8 @@ def _positions(
     if not len(known):
         return None, None, notes
     try:
-        found = planned_positions(known, planned.trajectory, planned.lasting_s, max_num)
+        fit = fit_to_map(known, planned.trajectory, tuple(planned.lasting_s), is_at_rest=True)
+        found = fit.at(IDENTITY, max_num)
         alone = the_map.solved([found])[1]
         assert alone.placement is not None, "known positions place the map"
         refuse_open_turn(alone.placement)

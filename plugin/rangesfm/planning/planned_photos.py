@@ -20,8 +20,7 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information
 from rangesfm.measurements.lengths.markers import images_by_name, triangulate_marker
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, locate_points
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.option_model import Key, Options
 from rangesfm.util.geometry.poses import Poses

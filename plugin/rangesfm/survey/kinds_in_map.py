@@ -27,7 +27,7 @@ from rangesfm.measurements.lengths.locate_lengths import (
 )
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import ARM, CLOCK
-from rangesfm.measurements.positions.grouped_positions import POSITIONS
+from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.cost import Ranges

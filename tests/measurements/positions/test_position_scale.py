@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.positions.grouped_positions import design_of_positions
 from rangesfm.measurements.positions.known_positions import KnownPositions
+from rangesfm.measurements.positions.position_fit import design_of_positions, determine
 from rangesfm.measurements.positions.position_scale import (
-    _determine,
     _doubts_of_axes,
     refuse_open_turn,
     scale_by_positions,
@@ -82,13 +81,13 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
 def test_three_positions_off_a_line_determine_a_similarity() -> None:
     places = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
     positions = replace(known_positions([True] * 4), places=places)
-    assert _determine(positions, np.array([True, False, True, True]))
-    assert not _determine(positions, np.array([True, False, False, True]))
-    assert not _determine(positions, np.array([True, True, True, False]))
+    assert determine(positions, np.array([True, False, True, True]))
+    assert not determine(positions, np.array([True, False, False, True]))
+    assert not determine(positions, np.array([True, True, True, False]))
     # The extents across and along are 1 / sqrt(3) and sqrt(2 / 3) of the lengths in a lean triangle.
     for across, is_enough in ((1.8e-7, True), (1.6e-7, False)):
         lean = replace(positions, places=places + across * np.array([[0.0], [1.0], [0.0], [0.0]]) * [0.0, 1.0, 0.0])
-        assert _determine(lean, np.array([True, True, True, False])) is is_enough
+        assert determine(lean, np.array([True, True, True, False])) is is_enough
 
 
 def test_too_few_positions_are_refused_with_their_number() -> None:

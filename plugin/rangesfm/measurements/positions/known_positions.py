@@ -18,6 +18,9 @@ of the troposphere, of satellites and of echoes in a hall for minutes. A mixture
 MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
 
+LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
+"""What to do about a control point that contradicts the others."""
+
 
 @dataclass(frozen=True)
 class KnownPositions:

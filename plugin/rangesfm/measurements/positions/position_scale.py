@@ -1,58 +1,69 @@
-"""The similarity from a map to the site by known positions: of marks (control points) and of an antenna on the camera.
-
-It is fitted robustly, and control points that contradict the others are left out.
-"""
+"""Known positions on a map as a kind of measurement: outlying control points, doubts, and tests of mistakes."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
-from rangesfm.arrays import Array, Indices, Mask, median, rms
+from rangesfm.arrays import Array, Mask, median, rms
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds, most_contradicting
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import LEFT_OUT, Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
-from rangesfm.measurements.positions.grouped_positions import (
+from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
+from rangesfm.measurements.positions.position_fit import (
     POSITIONS,
     GroupedPositions,
     PositionFit,
     at_point,
-    design_of_positions,
+    determine,
+    fit_to_map,
     stddev_of,
 )
-from rangesfm.measurements.positions.known_positions import (
-    MIN_NUM_POSITIONS,
-    KnownPositions,
-)
-from rangesfm.measurements.positions.position_tests import tests_of_positions
 from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.options import LEVER_ARM_M
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
-from rangesfm.solver.mistakes import MistakeTests
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
-from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
-from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape
-from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
+from rangesfm.util.geometry.similarity import Similarity, align_points
+from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import with_one_blas_thread
 
-# Most triples for a start.
-_MAX_NUM_TRIPLES = 300
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
 _MAX_TURN_STDDEV = 0.3
 # Positions are mirrored if the mirror image of the map fits them this many times as well.
 _MIRRORED = 3.0
+_POINT, _CHECK_POINT = "control point", "check point"
+_ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
+# Words, remedy and unit of the mistakes of an antenna's positions.
+_OF_ANTENNA = {
+    _ARM: (
+        "the antenna sits elsewhere on the camera, by {} (right, down, forward)",
+        "measure from lens to antenna again ([positions] antenna_in_cam_m)",
+        "m",
+    ),
+    _CLOCK: (
+        "the times of the positions are {} LATE",
+        "look for leap seconds, or let the offset be searched for ([positions] time_offset)",
+        "s",
+    ),
+    _DATUM: (
+        "the positions and the control points have frames that are shifted by {}",
+        "look which coordinate system and which height each of them has",
+        "m",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -116,9 +127,9 @@ class PositionScale(KindOnMap):
 
         def against_others(row: int) -> float:
             others = used & (np.arange(len(used)) != row)
-            if int(others.sum()) < MIN_NUM_POSITIONS or not _determine(known, others):
+            if not determine(known, others):
                 return 0.0
-            found[row] = replace(self, fit=_fitted(replace(self.fit, used=others)))
+            found[row] = replace(self, fit=replace(self.fit, used=others).again())
             return found[row]._statistic(row)
 
         worst, statistic = most_contradicting(rows, self._statistic, against_others)
@@ -287,85 +298,12 @@ def scale_by_positions(
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    used = _enough(known)
-    # A start that few wrong positions do not move; that of a map at rest.
-    start = IDENTITY if is_at_rest else _of_triples(known, np.flatnonzero(used))
-    nothing = np.zeros(len(known))
-    begun = PositionFit(
-        start, known, path, used, nothing, nothing, surveyed.lasting_s, metres_per_unit, is_at_rest=is_at_rest
-    )
-    found = PositionScale(_fitted(begun), bending, surveyed)
+    fit = fit_to_map(known, path, surveyed.lasting_s, is_at_rest=is_at_rest, metres_per_unit=metres_per_unit)
+    found = PositionScale(fit, bending, surveyed)
     while (without := found.without_worst()) is not None:
         found = without
     refuse_open_turn(found.alone.posterior.place)
     return found
-
-
-def _enough(known: KnownPositions) -> Mask:
-    """Return the control positions (k,); raises GeometryError if they do not determine a similarity."""
-    if not _determine(known, ~known.is_check):
-        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
-        raise GeometryError(f"{np.count_nonzero(~known.is_check)} known positions are in the map, {expected}")
-    return ~known.is_check
-
-
-def _fitted(begun: PositionFit) -> PositionFit:
-    """Fit the similarity by iteratively reweighted least squares, starting from that of the fit."""
-    known, similarity, used = begun.known, begun.similarity, begun.used
-    for _ in range(MAX_NUM_ROUNDS):
-        off_m = known.misclosures_m(similarity)
-        stddev_m = _stddevs_m(known, off_m, used)
-        away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
-        weights = used * CAUCHY.weights(away)
-        if begun.is_at_rest:  # the map has its place; only outliers are told apart
-            break
-        root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
-        by = root[:, None] * design_of_positions(known, similarity, begun.path)
-        step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
-        similarity = moved_similarity(similarity, step, begun.path)
-        if np.abs(step).max() < ROUNDING:
-            break
-    return replace(begun, similarity=similarity, weights=weights, stddev_m=stddev_m)
-
-
-def _stddevs_m(known: KnownPositions, off_m: Array, used: Mask) -> Array:
-    """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
-    stddevs, given = np.ones(len(known)), stddev_of(known.covariance_m2)
-    freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
-    # Half of all vectors of three normally distributed numbers are shorter than this.
-    median_length = np.sqrt(special.chdtri(3, 0.5))
-    for of_kind in (known.is_mark, ~known.is_mark):
-        if (rows := used & of_kind).any():
-            is_given = bool(np.isfinite(given[of_kind]).all())
-            ratio = given if is_given else np.ones(len(known))
-            shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
-            stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
-    return stddevs
-
-
-def planned_positions(
-    known: KnownPositions, path: Trajectory, lasting_s: Sequence[float], max_num: int
-) -> GroupedPositions:
-    """Return the observations of positions that are planned, on a map that is true.
-
-    Args:
-        known: without errors, in the model of ``path``, whose world is the site.
-        max_num: largest number of observations of an antenna.
-
-    Raises:
-        GeometryError: the positions are too few, or on one line.
-    """
-    nothing = np.zeros(len(known))
-    begun = PositionFit(IDENTITY, known, path, _enough(known), nothing, nothing, tuple(lasting_s), is_at_rest=True)
-    return _fitted(begun).at(IDENTITY, max_num)
-
-
-def _determine(known: KnownPositions, used: Mask) -> bool:
-    """Return whether positions determine a similarity: three or more that are not on one line."""
-    if used.sum() < MIN_NUM_POSITIONS:
-        return False
-    stddevs = path_shape(known.places[used]).stddevs
-    return bool(stddevs[1] > UNDETERMINED * stddevs[0])
 
 
 def refuse_open_turn(covariance: Array) -> None:
@@ -378,31 +316,86 @@ def refuse_open_turn(covariance: Array) -> None:
         )
 
 
-def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
-    """Return the similarity of three positions with the least sum of distances of all: a robust start.
+@with_one_blas_thread
+def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequence[MistakeTest]) -> MistakeTests:
+    """Return the tests of known positions.
 
-    Lever arms are taken off with the rotation of a first fit.
+    Args:
+        on_map: all that is measured in the map. against: tests that compare the positions with other kinds.
     """
-    places, targets = known.places[rows], known.position_m[rows]
-    for _ in range(2):
-        candidates = [align_points(places, targets)]
-        for chosen in map(list, _triples(len(rows))):
-            if not any(path_shape(each).is_line for each in (places[chosen], targets[chosen])):
-                candidates.append(align_points(places[chosen], targets[chosen]))
-        best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
-        targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
-    return best
+    left_out = positions.names_left_out
+    rows = [*_of_points(positions, on_map, left_out), *_of_antenna(positions, on_map)]
+    # Beside others that place the map, check points are compared with the map that all hold.
+    if not any(each.places_map and each.kind != positions.kind for each in on_map.kinds):
+        rows += _of_check_points(positions, on_map, left_out)
+    reasons = [
+        f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
+        for row in rows
+        if row.rejected and row.subject in left_out
+    ]
+    likely = [*_likeliest(rows), *(row for row in rows if row.rejected and row.name == _CHECK_POINT)]
+    reasons += [f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in likely]
+    if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
+        reasons.append(f"either {'; or '.join(doubted)}: {LOOK_AGAIN}")
+    reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
+    rows += against
+    rows.sort(key=lambda row: row.threshold - row.statistic)
+    return MistakeTests(tuple(rows), tuple(reasons), of_place=tuple(reasons))
 
 
-def _distance_sum(similarity: Similarity, places: Array, targets: Array) -> float:
-    return float(np.linalg.norm(similarity.apply(places) - targets, axis=1).sum())
+def _of_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
+    """Yield the test of each control point against all others."""
+    known = positions.known
+    for row in np.flatnonzero(known.is_mark).tolist():
+        if not known.is_check[row] or known.names[row] in left_out:
+            yield _of_point(positions, on_map, _POINT, row, positions.threshold)
 
 
-def _triples(num: int) -> Iterator[tuple[int, ...]]:
-    """Yield triples of numbers below ``num``: all if they are few, else some that are spread over them."""
-    if num * (num - 1) * (num - 2) // 6 <= _MAX_NUM_TRIPLES:
-        yield from itertools.combinations(range(num), MIN_NUM_POSITIONS)
+def _of_check_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
+    """Yield the test of each check point against the control points, which it does not move."""
+    known = positions.known
+    rows = [row for row in np.flatnonzero(known.is_mark & known.is_check).tolist() if known.names[row] not in left_out]
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(rows), 1)))
+    for row in rows:
+        yield replace(_of_point(positions, on_map, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
+
+
+def _of_point(positions: PositionScale, on_map: JointMap, kind: str, row: int, threshold: float) -> MistakeTest:
+    columns, name = positions.columns_of(on_map, at_point(positions.known, row)), positions.known.names[row]
+    found = on_map.problem.mistake(columns)
+    far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
+    return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
+
+
+def _likeliest(rows: Sequence[MistakeTest]) -> Sequence[MistakeTest]:
+    """Return the mistake of the antenna with the largest statistic, if any was found."""
+    found = [row for row in rows if row.rejected and row.name in _OF_ANTENNA]
+    return sorted(found, key=lambda row: -row.statistic)[:1]
+
+
+def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeTest]:
+    """Yield the tests of mistakes that change all positions of an antenna."""
+    known, placed = positions.known, on_map.estimate
+    rotation, is_antenna = placed.rotation, ~known.is_mark & positions.used
+    if not is_antenna.any():
         return
-    rng = np.random.default_rng(0)
-    for _ in range(_MAX_NUM_TRIPLES):
-        yield tuple(rng.choice(num, MIN_NUM_POSITIONS, replace=False).tolist())
+    shown = is_antenna[:, None, None]
+    columns = {_ARM: np.where(shown, rotation @ known.world_from_cam, 0.0)}
+    if known.velocity.any() and not known.clock_stddev_s.any():  # an offset that was searched for has no mistake
+        moves = placed.scale * known.velocity @ rotation.T
+        columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
+    if (known.is_mark & positions.used).sum() >= MIN_NUM_POSITIONS:
+        columns[_DATUM] = np.where(shown, np.eye(3), 0.0)
+    # Clocks that differ by more than the positions last have no moment in common.
+    most = {_ARM: LEVER_ARM_M.most, _CLOCK: float(np.ptp(known.time_s[is_antenna]))}
+    for name, of_all in columns.items():
+        by = of_all.reshape(3 * len(known), -1)
+        found = on_map.problem.learnt(in_problem := positions.columns_of(on_map, by)).mistake(in_problem)
+        threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
+        words, remedy, unit = _OF_ANTENNA[name]
+        if np.linalg.norm(found.sizes) > most.get(name, np.inf):
+            found = replace(found, statistic=0.0)
+        said = words.format(in_axes(found.sizes) if len(found.sizes) == 3 else f"{abs(found.sizes[0]):.2f} s")
+        if name == _CLOCK:
+            said = said.replace("LATE", "late" if found.sizes[0] < 0 else "early")
+        yield row_of_mistake(name, "", found, threshold, said, remedy, unit)

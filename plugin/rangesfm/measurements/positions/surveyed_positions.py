@@ -11,8 +11,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
-from rangesfm.measurements.positions.control_points import ControlPoints, marks_seen
-from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.positions.control_points import ControlPoints, locate_points, marks_seen
 from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
 

@@ -1,28 +1,33 @@
-"""Known positions as observations of a map: groups, with errors of points and receivers (section 4 of ``model.md``).
+"""Robust fit of known positions to a map, and these as observations: groups, with the errors of points and receivers.
 
 A known position p of something with the place c in the model and the lever arm a obeys p = scale * R c + R a + t. Its
 error has several parts: the survey of the point, the marks in the photos, noise of the antenna's positions, and errors
-of these that last for some time or belong to a place.
+of these that last for some time or belong to a place (section 4 of ``model.md``).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import special
 from scipy.sparse import block_diag, csr_array, diags_array, kron
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.measurements.positions.known_positions import KnownPositions
+from rangesfm.errors import GeometryError
+from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component, independent_unknowns
 from rangesfm.solver.posterior import Observations
-from rangesfm.util.geometry.similarity import Similarity, similarity_motions
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
 
 POSITIONS = "positions"
 # Names of errors of an antenna's positions that last for some time start with this, as do all of its positions.
@@ -31,6 +36,8 @@ _WARP = f"{_LASTING}warp"
 # Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
 # share of the noise that lasts, before anything is known.
 _SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
+# Most triples for a start.
+_MAX_NUM_TRIPLES = 300
 # Number of times of a group over which its correlation with others is averaged.
 _NUM_WITHIN = 8
 
@@ -70,6 +77,24 @@ class PositionFit:
     metres_per_unit: float = 1.0
     is_at_rest: bool = False
 
+    def again(self) -> PositionFit:
+        """Return the fit by iteratively reweighted least squares, starting from this similarity."""
+        known, similarity, used = self.known, self.similarity, self.used
+        for _ in range(MAX_NUM_ROUNDS):
+            off_m = known.misclosures_m(similarity)
+            stddev_m = _stddevs_m(known, off_m, used)
+            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
+            weights = used * CAUCHY.weights(away)
+            if self.is_at_rest:  # the map has its place; only outliers are told apart
+                break
+            root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
+            by = root[:, None] * design_of_positions(known, similarity, self.path)
+            step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
+            similarity = moved_similarity(similarity, step, self.path)
+            if np.abs(step).max() < ROUNDING:
+                break
+        return replace(self, similarity=similarity, weights=weights, stddev_m=stddev_m)
+
     def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
         """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
         known = self.known
@@ -94,6 +119,82 @@ class PositionFit:
             is_used=used,
             grouping=grouping,
         )
+
+
+def fit_to_map(
+    known: KnownPositions,
+    path: Trajectory,
+    lasting_s: tuple[float, ...],
+    *,
+    is_at_rest: bool = False,
+    metres_per_unit: float = 1.0,
+) -> PositionFit:
+    """Fit known positions in the model of a path robustly, with all control points; arguments as of ``PositionFit``.
+
+    Raises:
+        GeometryError: the positions are too few, or on one line.
+    """
+    used, nothing = ~known.is_check, np.zeros(len(known))
+    if not determine(known, used):
+        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+        raise GeometryError(f"{np.count_nonzero(used)} known positions are in the map, {expected}")
+    # A start that few wrong positions do not move; that of a map at rest.
+    start = IDENTITY if is_at_rest else _of_triples(known, np.flatnonzero(used))
+    begun = PositionFit(start, known, path, used, nothing, nothing, lasting_s, metres_per_unit, is_at_rest=is_at_rest)
+    return begun.again()
+
+
+def determine(known: KnownPositions, used: Mask) -> bool:
+    """Return whether positions determine a similarity: three or more that are not on one line."""
+    if used.sum() < MIN_NUM_POSITIONS:
+        return False
+    stddevs = path_shape(known.places[used]).stddevs
+    return bool(stddevs[1] > UNDETERMINED * stddevs[0])
+
+
+def _stddevs_m(known: KnownPositions, off_m: Array, used: Mask) -> Array:
+    """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
+    stddevs, given = np.ones(len(known)), stddev_of(known.covariance_m2)
+    freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
+    # Half of all vectors of three normally distributed numbers are shorter than this.
+    median_length = np.sqrt(special.chdtri(3, 0.5))
+    for of_kind in (known.is_mark, ~known.is_mark):
+        if (rows := used & of_kind).any():
+            is_given = bool(np.isfinite(given[of_kind]).all())
+            ratio = given if is_given else np.ones(len(known))
+            shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
+            stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
+    return stddevs
+
+
+def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
+    """Return the similarity of three positions with the least sum of distances of all: a robust start.
+
+    Lever arms are taken off with the rotation of a first fit.
+    """
+    places, targets = known.places[rows], known.position_m[rows]
+    for _ in range(2):
+        candidates = [align_points(places, targets)]
+        for chosen in map(list, _triples(len(rows))):
+            if not any(path_shape(each).is_line for each in (places[chosen], targets[chosen])):
+                candidates.append(align_points(places[chosen], targets[chosen]))
+        best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
+        targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
+    return best
+
+
+def _distance_sum(similarity: Similarity, places: Array, targets: Array) -> float:
+    return float(np.linalg.norm(similarity.apply(places) - targets, axis=1).sum())
+
+
+def _triples(num: int) -> Iterator[tuple[int, ...]]:
+    """Yield triples of numbers below ``num``: all if they are few, else some that are spread over them."""
+    if num * (num - 1) * (num - 2) // 6 <= _MAX_NUM_TRIPLES:
+        yield from itertools.combinations(range(num), MIN_NUM_POSITIONS)
+        return
+    rng = np.random.default_rng(0)
+    for _ in range(_MAX_NUM_TRIPLES):
+        yield tuple(rng.choice(num, MIN_NUM_POSITIONS, replace=False).tolist())
 
 
 def design_of_positions(known: KnownPositions, site_from_model: Similarity, path: Trajectory) -> Array:
