@@ -13,7 +13,6 @@ from rangesfm.arrays import Array, median, rms
 from rangesfm.comparison.same_photos import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.text_tables import align_rows
@@ -104,7 +103,7 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> str
         raise InputError("the run did not refine (no sparse_metric/0): a reference is needed to compare", output_path)
     tables = []
     if reference_path is not None:
-        path = path_in_result(scaled, result)
+        path = result.path_in(scaled)
         paths = {"scaled": path} if refined is None else {"scaled": path, "refined": path.as_in(refined)}
         rows = papers_table(paths, read_reference(reference_path), frame=result.summary.frame)
         tables.append(format_table(rows, result.summary.frame))

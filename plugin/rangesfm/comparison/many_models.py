@@ -23,7 +23,6 @@ from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.lengths.tape_file import markers_of_photos
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.report.report_tables import ReportTable
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model
@@ -235,7 +234,7 @@ def _read_model(path: Path) -> NamedModel:
         metric = result.read_metric_model()
         if metric is None:
             raise InputError("the result holds no metric model", path)
-        return NamedModel(str(path), path_in_result(metric, result), metric, result, result.summary.frame)
+        return NamedModel(str(path), result.path_in(metric), metric, result, result.summary.frame)
     model, kind = read_model(path), path.absolute().parent.name
     frame = result.summary.frame if result is not None and kind in ("sparse_scaled", "sparse_metric") else None
     return NamedModel(str(path), trajectory_from_reconstruction(model), model, None, frame)

@@ -13,7 +13,6 @@ from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats,
 from rangesfm.export.metric_map import in_frame, near_origin
 from rangesfm.export.offset import write_offset
 from rangesfm.options import ExportOptions
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import CenterCovariances
 from rangesfm.sfm.steps import DATABASE_NAME
@@ -114,7 +113,7 @@ def _read_map(result: ResultFolder) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
-    path_in_result(reconstruction, result)  # raises an error where no photo has a time: the trajectory would be empty
+    result.path_in(reconstruction)  # raises an error where no photo has a time: the trajectory would be empty
     return MetricMap(
         reconstruction,
         timestamps_s=result.timestamps_s,

@@ -25,7 +25,6 @@ from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.run import map_in_metres, with_results
 from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import SILENT, Journal, Progress
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
@@ -105,7 +104,7 @@ def _read(name: str, result: ResultFolder) -> FinishedRun:
     model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
     if not ranges:
         raise InputError("has no ranges.csv: surveys are joined through anchors, so each needs ranges", result.path)
-    path = path_in_result(model, result)
+    path = result.path_in(model)
     if not is_one_after_the_other(path):
         expected = "expected the result of one survey: join all surveys at once"
         raise InputError(

@@ -20,7 +20,6 @@ from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_sensor import PlannedSensor
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.contents import AnyPath
@@ -54,7 +53,7 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
         raise InputError("has no metric model, expected a finished result", path)
     if not len(used) and imu is None:
         raise InputError("was made without ranges, expected a result with some: a plan takes the radio from them", path)
-    trajectory = path_in_result(model, folder)
+    trajectory = folder.path_in(model)
     if not is_one_after_the_other(trajectory):
         expected = "expected the result of one survey"
         raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)

@@ -102,14 +102,11 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
                     yield _advice(change, expect_roughly(change[3], expected.vision), before, expected)
 
     more = list(tried(_with_one_more(planned)))
-    found = [*more, *tried(_moved(planned, _best_places(more))), *tried(_changes(planned))]
-    return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > LEAST_GAIN)
-
-
-def _best_places(more: Sequence[Advice]) -> list[Array]:
-    """Return the place where one more anchor gains most for the scale, and that for the position if it is another."""
+    # The place where one more anchor gains most for the scale, and that for the position if it is another.
     best = [max(more, key=attrgetter(gain)) for gain in ("scale_gain", "place_gain") if more]
-    return list({id(each): each.planned.anchors_m[-1] for each in best}.values())
+    places = list({id(each): each.planned.anchors_m[-1] for each in best}.values())
+    found = [*more, *tried(_moved(planned, places)), *tried(_changes(planned))]
+    return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > LEAST_GAIN)
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:

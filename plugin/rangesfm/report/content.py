@@ -13,7 +13,6 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.export.metric_map import colored_points
-from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import MODEL_NAMES, ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.folders import real_path
@@ -92,7 +91,7 @@ class Content:
         times = np.where(np.isfinite(self.ranges.timestamp_s), self.ranges.timestamp_s, times)
         self.range_times_s = times - np.min(times, initial=np.inf, where=np.isfinite(times))
         scaled, refined = models = [result.read_model(stage) or pycolmap.Reconstruction() for stage in MODEL_NAMES]
-        self.scaled, self.refined = (path_in_result(model, result) for model in models)
+        self.scaled, self.refined = (result.path_in(model) for model in models)
         self.final, final = (self.refined, refined) if self.refined else (self.scaled, scaled)
         self.points_m, self.points_rgb = colored_points(final)
         self.point_ids = np.array(sorted(final.point3D_ids()), dtype=np.int64)
@@ -123,7 +122,7 @@ class Content:
         ranges, path, anchors_m = self.ranges, self.final, self.result.anchor_positions_m
         index_of = {name: i for i, name in enumerate(path.image_names)}
         distances = np.full(len(ranges), np.nan)
-        for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
+        for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used) if self.reference_by_photo else ():
             fraction = float(ranges.weight[row])
             name = (ranges.keyframe_before if fraction < 0.5 else ranges.keyframe_after)[row]
             position, anchor = self.reference_by_photo.get(name), anchors_m.get(ranges.anchor_id[row])

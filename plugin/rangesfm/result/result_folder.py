@@ -22,6 +22,7 @@ from rangesfm.util.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.util.files.folders import real_path
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.reference import Reference, read_reference
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 _Table = TypeVar("_Table", bound=TableFile)
 
@@ -133,6 +134,17 @@ class ResultFolder:
         """Read the model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
         path = self.path / stage / "0"
         return read_model(path) if path.is_dir() else None
+
+    def path_in(self, model: pycolmap.Reconstruction) -> Trajectory:
+        """Return the camera's path in a model of this result, with the times of its photos.
+
+        Raises:
+            InputError: the result has photo times, but none for a photo of the model.
+        """
+        path = trajectory_from_reconstruction(model, self.timestamps_s)
+        if not len(path) and model.num_reg_images():
+            raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", self.path)
+        return path
 
     def read_metric_model(self) -> pycolmap.Reconstruction | None:
         """Read the refined model, else the scaled one; None if neither is there."""
