@@ -10,9 +10,9 @@ import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.positions.clock import POSITIONS
+from rangesfm.measurements.positions.clock import TimedPositions
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.time_offset import REMEDY
+from rangesfm.measurements.ranges.clock.timed_ranges import TimedRanges
 from rangesfm.pipeline.metric_result import Rivals
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -43,9 +43,9 @@ def by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Riv
 
     found = list[Rivals]()
     if offset is not None and offset.rivals:
-        found.append(scale_by_rivals(estimate, trajectory, offset, at_ranges_offset, "", REMEDY))
+        found.append(scale_by_rivals(estimate, trajectory, offset, at_ranges_offset, "", TimedRanges.remedy))
     if track is not None and (search := track.offset) is not None and search.rivals:
-        remedy = POSITIONS.remedy
+        remedy = TimedPositions.remedy
         found.append(scale_by_rivals(estimate, trajectory, search, at_positions_offset, " of the positions", remedy))
     return Rivals(sum((each.doubts for each in found), ()), math.hypot(*(each.stddev for each in found)))
 

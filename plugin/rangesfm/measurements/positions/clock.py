@@ -5,31 +5,17 @@ The rule by which offsets are found, compared and doubted is that of ranges (``r
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
-from rangesfm.measurements.ranges.clock.fit import OffsetFit, refine_offset
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.search import (
-    Cells,
-    OffsetCurve,
-    PathSamples,
-    Scanned,
-    centred_columns,
-    scan_parts,
-)
+from rangesfm.measurements.ranges.clock.fit import Observed
+from rangesfm.measurements.ranges.clock.search import Cells, PathSamples, Scanned, centred_columns
 from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stddev
-from rangesfm.measurements.ranges.clock.time_offset import (
-    ObservedKind,
-    offset_of_motion,
-    path_to_search,
-    require_enough,
-)
+from rangesfm.measurements.ranges.clock.time_offset import offset_of_motion, path_to_search, require_enough
 from rangesfm.progress import SILENT
 from rangesfm.util.files.photo_names import rows_of_photos, told_none
 from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
@@ -41,15 +27,55 @@ from rangesfm.util.geometry.trajectory import Trajectory
 _MUCH_WORSE = 3.0
 
 
-class TimedPositions(NamedTuple):
-    """n positions in metres, with times on their clock."""
+@dataclass(frozen=True)
+class TimedPositions(Observed):
+    """n positions (n, 3) in metres."""
 
-    times_s: Array
     position_m: Array
 
-    def take(self, rows: Indices | Mask) -> TimedPositions:
-        """Return some of the positions."""
-        return TimedPositions(self.times_s[rows], self.position_m[rows])
+    name = "positions"
+    remedy = "give the time offset (--positions_time_offset)"
+
+    @property
+    def numbers_m(self) -> Array:
+        return self.position_m.ravel()
+
+    @property
+    def alike(self) -> Indices:
+        return np.tile(np.arange(3), len(self.times_s))
+
+    @property
+    def start_weights(self) -> Array:
+        return _weights_by_place(self.position_m)
+
+    def solved(self, points: Array) -> RobustFit:
+        return fit_similarity(points, self.position_m)
+
+    def scanned(self, weights: Array, path: PathSamples) -> Scanned:
+        """Return the similarity that fits best at each offset.
+
+        Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+        Its sums over pairs of points are correlations in time.
+        """
+        cells = Cells.from_times(self.times_s, path)
+        correlate = cells.correlate
+        squared, *centers, known = centred_columns(path, cells.stride).T
+        of_path = [cells.of_path(values) for values in (known, *centers, squared)]
+        position_m = self.position_m - np.median(self.position_m, axis=0)
+        of_log = [cells.of_log(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
+        square_m2 = np.sum(position_m**2, axis=1)
+        num = correlate(of_path[0], of_log[0])
+        total = np.maximum(num, 1e-12 * weights.sum())
+        mean_of_path = np.stack([correlate(values, of_log[0]) for values in of_path[1:4]], axis=1) / total[:, None]
+        mean_m = np.stack([correlate(of_path[0], values) for values in of_log[1:]], axis=1) / total[:, None]
+        products = np.array([[correlate(own, values) for own in of_path[1:4]] for values in of_log[1:]]) / total
+        cross = np.moveaxis(products, 2, 0) - mean_m[:, :, None] * mean_of_path[:, None, :]
+        of_places = np.maximum(correlate(of_path[4], of_log[0]) / total - np.sum(mean_of_path**2, axis=1), 0.0)
+        variation = correlate(of_path[0], cells.of_log(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
+        strengths = np.linalg.svd(cross, compute_uv=False)
+        strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
+        explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
+        return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
 
 
 def fit_similarity(points: Array, position_m: Array) -> RobustFit:
@@ -71,80 +97,18 @@ def fit_similarity(points: Array, position_m: Array) -> RobustFit:
     return RobustFit(of_coordinates, residuals_m.ravel(), gradient, found.scale, 7, basis[:, is_shown])
 
 
-def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
-    """Fit the positions that are on the path at one offset.
-
-    Args:
-        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
-    """
-    positions = positions.take(path.knows(positions.times_s + offset_s))
-    num = len(positions.times_s)
-    points, velocities = path.tag(positions.times_s + offset_s, np.zeros(num, dtype=np.int64), scale)
-    solved, axes = fit_similarity(points, positions.position_m), np.tile(np.arange(3), num)
-    return OffsetFit.from_solution(offset_s, positions, positions.position_m.ravel(), axes, solved, velocities)
-
-
 def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
     """Return the robust stddev of a coordinate's residuals at one offset, metres; infinite with too few positions."""
     if not path.knows(positions.times_s + offset_s).any():
         return np.inf
-    fit = fit_positions(positions, path, offset_s, fit_positions(positions, path, offset_s).solved.scale)
+    fit = positions.fit(path, offset_s, positions.fit(path, offset_s).solved.scale)
     return fit.residual_stddev_m if fit.is_testable else np.inf
-
-
-def scan_positions(positions: TimedPositions, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
-    """Compute cost and score of every offset at which positions and path overlap, without the lever arm.
-
-    Args:
-        positions: n positions in any order. path: a path with at least one known pose.
-        weights: (n,) of the positions; None: less for those far from most others.
-    """
-    weights = _weights_by_place(positions.position_m) if weights is None else weights
-    return scan_parts(positions.times_s, path, lambda rows: _scan(positions.take(rows), weights[rows], path))
 
 
 def _weights_by_place(position_m: Array) -> Array:
     """Return (n,) weights that keep positions far away from most others from deciding."""
     far_m = np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1)
     return CAUCHY.weights(far_m / max(float(np.median(far_m)), rounding_of(position_m)))
-
-
-def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scanned:
-    """Return the result for one part of the log, by the similarity that fits best at each offset.
-
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. Its
-    sums over pairs of points are correlations in time.
-    """
-    cells = Cells.from_times(positions.times_s, path)
-    correlate = cells.correlate
-    squared, *centers, known = centred_columns(path, cells.stride).T
-    of_path = [cells.of_path(values) for values in (known, *centers, squared)]
-    position_m = positions.position_m - np.median(positions.position_m, axis=0)
-    of_log = [cells.of_log(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
-    square_m2 = np.sum(position_m**2, axis=1)
-    num = correlate(of_path[0], of_log[0])
-    total = np.maximum(num, 1e-12 * weights.sum())
-    mean_of_path = np.stack([correlate(values, of_log[0]) for values in of_path[1:4]], axis=1) / total[:, None]
-    mean_m = np.stack([correlate(of_path[0], values) for values in of_log[1:]], axis=1) / total[:, None]
-    products = np.array([[correlate(own, values) for own in of_path[1:4]] for values in of_log[1:]]) / total
-    cross = np.moveaxis(products, 2, 0) - mean_m[:, :, None] * mean_of_path[:, None, :]
-    of_places = np.maximum(correlate(of_path[4], of_log[0]) / total - np.sum(mean_of_path**2, axis=1), 0.0)
-    variation = correlate(of_path[0], cells.of_log(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
-    strengths = np.linalg.svd(cross, compute_uv=False)
-    strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
-    explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
-    return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
-
-
-def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
-    """Refine an offset; a drift of the clocks is not looked for."""
-    fit = refine_offset(positions, path, offset_s, fit_at=fit_positions)
-    return fit, replace(fit.timed(), reference_s=float(positions.times_s.mean()))
-
-
-POSITIONS = ObservedKind(
-    "positions", "give the time offset (--positions_time_offset)", scan_positions, fit_positions, _fit_clock
-)
 
 
 def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
@@ -163,9 +127,9 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         raise InputError("the positions have times but the photos have none: give image times", track.log.path)
     positions = TimedPositions(track.log.timestamp_s, track.log.position_m)
     try:
-        require_enough(path, len(track.log), POSITIONS)
+        require_enough(path, len(track.log), TimedPositions)
         samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
-        found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SILENT)
+        found = offset_of_motion(positions, samples, seed=0, progress=SILENT)
     except GeometryError:
         if track.offset is None:
             raise

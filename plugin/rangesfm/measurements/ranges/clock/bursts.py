@@ -10,8 +10,8 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.clock.offset import CostCurve
-from rangesfm.measurements.ranges.clock.search import TimedRanges
 from rangesfm.measurements.ranges.clock.squares import fit_squares
+from rangesfm.measurements.ranges.clock.timed_ranges import TimedRanges
 from rangesfm.measurements.ranges.errors.noise import MIN_NOISE_M
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.trajectory import Trajectory

@@ -1,23 +1,23 @@
 """Robust fit of observations to the path at one time offset, with the offset's uncertainty and the drift of the clocks.
 
-The observations are ranges here; ``rangesfm.measurements.positions.clock`` fits the coordinates of positions in the
-same way.
+The observations are ranges, or the coordinates of positions (``rangesfm.measurements.positions.clock``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy import special
 
-from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.search import MIN_COVERAGE, AnyObserved, Observed, PathSamples, TimedRanges
-from rangesfm.measurements.ranges.clock.squares import RobustFit, fit_squares, residual_stddev
+from rangesfm.measurements.ranges.clock.search import MIN_COVERAGE, OffsetCurve, PathSamples, Scanned, scan_parts
+from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stddev
 from rangesfm.measurements.ranges.errors.noise import STRETCH_S
 from rangesfm.util.geometry.numerics import (
     MAX_NUM_ROUNDS,
@@ -26,6 +26,9 @@ from rangesfm.util.geometry.numerics import (
     SIGNIFICANT_STDDEVS,
     UNDETERMINED,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0
@@ -43,8 +46,78 @@ _MIN_NUM_BLOCKS = 12
 _MIN_GAIN_STDDEVS = 7.0
 
 
-FitAt = Callable[[AnyObserved, PathSamples, float, float], "OffsetFit"]
-"""Fit of observations at an offset, given the metres per model unit (infinity leaves the lever arm out)."""
+@dataclass(frozen=True)
+class Observed(ABC):
+    """What was observed at m times, such as ranges, as a time offset is found from it.
+
+    Attributes:
+        times_s: (m,) times on the clock of the observing system.
+    """
+
+    times_s: Array
+
+    name: ClassVar[str]
+    """What they are, in words."""
+    remedy: ClassVar[str]
+    """What the user can do where the motion does not determine the offset."""
+    may_drift: ClassVar[bool] = False
+    """Whether a drift of the clocks is looked for."""
+
+    @property
+    @abstractmethod
+    def numbers_m(self) -> Array:
+        """(n,) observed numbers, as many for each time, such as coordinates."""
+
+    @property
+    @abstractmethod
+    def alike(self) -> Indices:
+        """(n,) index of the series that each number belongs to, such as its anchor."""
+
+    @property
+    def antenna(self) -> Indices:
+        """(m,) index of the antenna that observed."""
+        return np.zeros(len(self.times_s), dtype=np.int64)
+
+    @property
+    @abstractmethod
+    def start_weights(self) -> Array:
+        """(m,) weights with which all offsets are compared at first."""
+
+    @abstractmethod
+    def solved(self, points: Array) -> RobustFit:
+        """Fit the numbers to the (m, 3) places of the antennas, in model units."""
+
+    @abstractmethod
+    def scanned(self, weights: Array, path: PathSamples) -> Scanned:
+        """Return the best fit at every offset, with (m,) weights and without the lever arm."""
+
+    def take(self, rows: Indices | Mask) -> Self:
+        """Return some of the observations."""
+        return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
+
+    def on_path(self, path: PathSamples, offset_s: float, max_num: int) -> Self:
+        """Return the first observations that are on the path at an offset, at most ``max_num``."""
+        return self.take(np.flatnonzero(path.knows(self.times_s + offset_s))[:max_num])
+
+    def scan(self, path: PathSamples, weights: Array) -> OffsetCurve:
+        """Compute cost and score of every offset at which observations and path overlap, without the lever arm.
+
+        The lever arm makes little difference at this resolution.
+
+        Args:
+            path: a path with at least one known pose. weights: (m,).
+        """
+        return scan_parts(self.times_s, path, lambda rows: self.take(rows).scanned(weights[rows], path))
+
+    def fit(self, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
+        """Fit those that are on the path at one offset.
+
+        Args:
+            scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
+        """
+        here = self.take(path.knows(self.times_s + offset_s))
+        points, velocities = path.tag(here.times_s + offset_s, here.antenna, scale)
+        return OffsetFit.from_solution(offset_s, here, here.solved(points), velocities)
 
 
 @dataclass(frozen=True)
@@ -74,21 +147,18 @@ class OffsetFit:
         cls,
         offset_s: float,
         observed: Observed,
-        measured_m: Array,
-        alike: Indices,
         solved: RobustFit,
         velocities: Array,
     ) -> OffsetFit:
         """Make a fit from its solution.
 
         Args:
-            measured_m: (n,) observed numbers. alike: (n,) index of the series that each belongs to, such as its anchor.
             velocities: (m, 3) of the points on the path at the m observations, model units per second.
         """
-        deviations = measured_m.copy()
+        deviations, alike = observed.numbers_m.copy(), observed.alike
         for rows in rows_by_key(alike):
             deviations[rows] -= np.median(deviations[rows])
-        num_each = len(measured_m) // max(len(observed.times_s), 1)
+        num_each = len(deviations) // max(len(observed.times_s), 1)
         times_s = np.repeat(observed.times_s, num_each)
         cells = np.floor(times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
         num_cells = len(np.unique(cells))
@@ -185,35 +255,17 @@ class OffsetFit:
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
-    """Fit the ranges that are on the path at one offset.
-
-    Args:
-        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
-    """
-    ranges = ranges.take(path.knows(ranges.times_s + offset_s))
-    points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
-    solved = fit_squares(points, ranges.range_m, ranges.anchor)
-    return OffsetFit.from_solution(offset_s, ranges, ranges.range_m, ranges.anchor, solved, velocities)
-
-
-def refine_offset(
-    observed: AnyObserved,
-    path: PathSamples,
-    offset_s: float,
-    rival: OffsetFit | None = None,
-    fit_at: FitAt[Any] = fit_at_offset,
-) -> OffsetFit:
+def refine_offset(observed: Observed, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
     """Refine an offset by Gauss-Newton steps to the nearest one that fits the observations best.
 
     Args:
-        observed: ranges, or what else ``fit_at`` fits, that are (nearly) all on the path at the given offset.
+        observed: those that are (nearly) all on the path at the given offset.
         path: the path.
         offset_s: the offset to start from.
         rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
     # The lever arm comes in only after the scale has been estimated.
-    found = fit_at(observed, path, offset_s, fit_at(observed, path, offset_s, np.inf).solved.scale)
+    found = observed.fit(path, offset_s, observed.fit(path, offset_s).solved.scale)
     for _ in range(MAX_NUM_ROUNDS):
         if rival is not None and found.is_hopeless_beside(rival):
             break
@@ -226,7 +278,7 @@ def refine_offset(
         offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
         if np.mean(path.knows(observed.times_s + offset_s)) < MIN_COVERAGE:
             break
-        found = fit_at(observed, path, offset_s, found.solved.scale)
+        found = observed.fit(path, offset_s, found.solved.scale)
     return found
 
 
@@ -289,24 +341,25 @@ def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks
     return [variances(block) for block in blocks]
 
 
-def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
-    """Refine an offset, and if the ranges show a significant drift, offset and drift together.
+def fit_clocks(observed: Observed, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
+    """Refine an offset, and if the observations show a significant drift, offset and drift together.
 
     Returns:
-        The fit, with the drift removed from the times of its ranges, and the offset, which follows a significant drift.
+        The fit, with the drift removed from the times of its observations, and the offset, which follows a significant
+        drift.
     """
-    reference_s = float(ranges.times_s.mean())
-    fit = refine_offset(ranges, path, offset_s)
+    reference_s = float(observed.times_s.mean())
+    fit = refine_offset(observed, path, offset_s)
     found, followed, least_stddevs = fit.timed(), 0.0, SIGNIFICANT_STDDEVS
-    for _ in range(MAX_NUM_ROUNDS):
+    for _ in range(MAX_NUM_ROUNDS if observed.may_drift else 0):
         if not abs(found.drift) > least_stddevs * found.drift_stddev:
             break
         followed, least_stddevs = followed + found.drift, NEGLIGIBLE_STDDEVS
         # The times become those of a radio clock that runs at the rate of the camera's.
-        times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
-        fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
+        times_s = observed.times_s + followed * (observed.times_s - reference_s)
+        fit = refine_offset(replace(observed, times_s=times_s), path, fit.offset_s)
         found = fit.timed()
-    note = _drift_note(followed, found.drift_stddev, ranges.times_s) if followed else None
+    note = _drift_note(followed, found.drift_stddev, observed.times_s) if followed else None
     drift, is_followed = followed or found.drift, followed != 0
     return fit, replace(found, drift=drift, drift_is_followed=is_followed, reference_s=reference_s, note=note)
 

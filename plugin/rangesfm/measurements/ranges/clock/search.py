@@ -1,26 +1,23 @@
-"""Search over all time offsets: the fit of the ranges at every offset, computed at once by correlation.
+"""Search over all time offsets: the fit of what was observed at every offset, computed at once by correlation.
 
-The sums in the normal equations of the linear fit (see ``squares``) are correlations in time of the ranges with
-products of |c|^2, c and 1 along the path. Fast Fourier transforms therefore give the best fit at all offsets in one
-pass.
+The sums in the normal equations of a linear fit are correlations in time of observations with products of |c|^2, c and
+1 along the path. Fast Fourier transforms therefore give the best fit at all offsets in one pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
-from typing import NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
-from rangesfm.arrays import Array, Indices, Mask, rows_by_key
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.clock.offset import CostCurve
-from rangesfm.measurements.ranges.clock.squares import MIN_RANGE_M
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.options import RangesOptions
@@ -36,34 +33,6 @@ MIN_COVERAGE = 0.5
 """Fraction of the largest possible number of ranges on the path; an offset that puts fewer there is not tried."""
 # Number of offsets in the curve for the report that are taken from all, and of those nearest to the best one.
 _NUM_SHOWN = 200
-
-
-class Observed(Protocol):
-    """What was observed at n times, such as ranges."""
-
-    @property
-    def times_s(self) -> Array:
-        """(n,) times on the clock of the observing system."""
-        ...
-
-    def take(self: AnyObserved, rows: Indices | Mask) -> AnyObserved:
-        """Return some of the observations."""
-        ...
-
-
-AnyObserved = TypeVar("AnyObserved", bound=Observed)
-
-
-class TimedRanges(NamedTuple):
-    """n ranges: times on the radio's clock, ranges in metres, and indices of anchor and tag."""
-
-    times_s: Array
-    range_m: Array
-    anchor: Indices
-    tag: Indices
-
-    def take(self, rows: Indices | Mask) -> TimedRanges:
-        return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
 
 
 @dataclass(frozen=True)
@@ -135,11 +104,6 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: RangesOpt
     return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
 
 
-def on_path(observed: AnyObserved, path: PathSamples, offset_s: float, max_num: int) -> AnyObserved:
-    """Return the first observations that are on the path at an offset, at most ``max_num``."""
-    return observed.take(np.flatnonzero(path.knows(observed.times_s + offset_s))[:max_num])
-
-
 @dataclass(frozen=True)
 class OffsetCurve(CostCurve):
     """Cost and score of m offsets that put a large enough fraction of the ranges on the path.
@@ -168,20 +132,6 @@ class OffsetCurve(CostCurve):
         peaks = np.flatnonzero(self.scores == highest)
         best = peaks[np.argsort(-self.scores[peaks], kind="stable")[:max_num]]
         return list(map(float, self.offsets_s[best]))
-
-
-def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
-    """Compute cost and score of every offset at which log and path overlap, without the lever arm.
-
-    The lever arm makes little difference at this resolution.
-
-    Args:
-        ranges: n ranges in any order.
-        path: a path with at least one known pose.
-        weights: (n,) weights of the ranges; None: equal weights.
-    """
-    weights = np.ones(len(ranges.range_m)) if weights is None else weights
-    return scan_parts(ranges.times_s, path, lambda rows: _scan(ranges.take(rows), weights[rows], path))
 
 
 def scan_parts(times_s: Array, path: PathSamples, scan: Callable[[Indices], Scanned]) -> OffsetCurve:
@@ -276,23 +226,6 @@ class Cells:
         return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
 
 
-def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
-    """Return the result for one part of the log."""
-    cells = Cells.from_times(ranges.times_s, path)
-    columns = centred_columns(path, cells.stride)
-    pairs = combinations_with_replacement(range(columns.shape[1]), 2)
-    products = {(i, j): cells.of_path(columns[:, i] * columns[:, j]) for i, j in pairs}
-
-    sums = np.zeros((5, len(cells.offsets_s)))
-    for rows in rows_by_key(ranges.anchor):
-        of_anchor = replace(cells, cell=cells.cell[rows])
-        sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], of_anchor, products)
-    num, variation, without, column, cross = sums
-    scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)
-    residual = without - 2 * scale_squared * cross + scale_squared**2 * column
-    return Scanned(num, cells.offsets_s, variation, residual)
-
-
 def centred_columns(path: PathSamples, stride: int) -> Array:
     """Return the columns (m, 5) in which the squared range is linear: |c|^2, c and 1, with c centred and scaled.
 
@@ -306,42 +239,3 @@ def centred_columns(path: PathSamples, stride: int) -> Array:
     spread = float(np.sqrt(np.sum(centers**2) / num_known))
     centers = centers / spread if spread > least else np.zeros_like(centers)
     return np.column_stack([np.sum(centers**2, axis=1, keepdims=True), centers, known])
-
-
-def _sums_of_anchor(
-    range_m: Array,
-    weights: Array,
-    cells: Cells,
-    products: dict[tuple[int, int], npt.NDArray[np.complex128]],
-) -> Array:
-    """Return five weighted sums over the ranges of one anchor on the path (5, num_offsets).
-
-    They are the sum of weights; the squared deviation from the anchor's mean; its part that c and 1 do not explain; the
-    squared part of the column |c|^2 that c and 1 do not explain; and the product of both unexplained parts.
-    """
-    squared = range_m**2 - np.median(range_m**2)
-    # Division by the derivative of rho^2 converts residuals back to metres.
-    weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
-
-    correlate = cells.correlate
-    own_weights, weighted = cells.of_log(weight), cells.of_log(weight * squared)
-    ones = max(products)[0]  # the last of the columns, from 0
-    normal = np.empty((len(cells.offsets_s), ones + 1, ones + 1))
-    for (i, j), product in products.items():
-        normal[:, i, j] = normal[:, j, i] = correlate(product, own_weights)
-    right = np.stack([correlate(products[i, ones], weighted) for i in range(ones + 1)], axis=1)
-    total = correlate(products[ones, ones], cells.of_log(weight * squared**2))
-    num = correlate(products[ones, ones], cells.of_log(weights))
-
-    # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
-    own = normal[:, 1:, 1:] + (1e-6 * normal[:, ones, ones] + 1e-9 * weight.sum())[:, None, None] * np.eye(ones)
-    solved = np.linalg.solve(own, np.stack([normal[:, 1:, 0], right[:, 1:]], axis=2))
-    return np.stack(
-        [
-            num,
-            np.maximum(total - right[:, ones] ** 2 / own[:, -1, -1], 0.0),
-            total - np.einsum("mi,mi->m", right[:, 1:], solved[:, :, 1]),
-            normal[:, 0, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 0]),
-            right[:, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 1]),
-        ]
-    )

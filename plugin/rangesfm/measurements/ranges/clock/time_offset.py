@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,24 +12,10 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.ranges.association import associate, is_too_long
 from rangesfm.measurements.ranges.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.measurements.ranges.clock.fit import (
-    SEPARATION_S,
-    FitAt,
-    OffsetFit,
-    fit_at_offset,
-    fit_clocks,
-    refine_offset,
-)
+from rangesfm.measurements.ranges.clock.fit import SEPARATION_S, Observed, OffsetFit, fit_clocks, refine_offset
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.search import (
-    Observed,
-    OffsetCurve,
-    PathSamples,
-    TimedRanges,
-    moving_path,
-    on_path,
-    scan_offsets,
-)
+from rangesfm.measurements.ranges.clock.search import PathSamples, moving_path
+from rangesfm.measurements.ranges.clock.timed_ranges import TimedRanges
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.options import RangesOptions
@@ -40,7 +25,6 @@ from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.util.processes.threads import with_one_blas_thread
 
-REMEDY = "give the time offset (--ranges_time_offset)"
 # With more likely offsets than this the estimate fails.
 _MAX_NUM_LIKELY = 3
 # Log and photos usually cover the same time. An offset that puts fewer observations on the path than this fraction of
@@ -96,7 +80,7 @@ def estimate_time_offset(
         raise InputError("the log has no timestamps, so that no time offset can be found", log.source)
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
-    require_enough(trajectory, len(log), _RANGES)
+    require_enough(trajectory, len(log), TimedRanges)
     tags = log.lever_arms(tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
@@ -107,29 +91,10 @@ def estimate_time_offset(
             if found is not None:
                 return found
     path = path_to_search(trajectory, tags, association)
-    return offset_of_motion(ranges, path, _RANGES, seed=seed, progress=progress)
+    return offset_of_motion(ranges, path, seed=seed, progress=progress)
 
 
-class ObservedKind(NamedTuple):
-    """A kind of observations that a time offset is found from.
-
-    Attributes:
-        name: in words. remedy: what the user can do where the motion does not determine the offset.
-        scan: computes cost and score of all offsets, given weights or None. fit_at: fits one offset.
-        fit_clocks: refines an offset with all that was observed, and returns the fit and what it says of the clocks.
-    """
-
-    name: str
-    remedy: str
-    scan: Callable[[Any, PathSamples, Array | None], OffsetCurve]
-    fit_at: FitAt[Any]
-    fit_clocks: Callable[[Any, PathSamples, float], tuple[OffsetFit, TimeOffset]]
-
-
-_RANGES = ObservedKind("ranges", REMEDY, scan_offsets, fit_at_offset, fit_clocks)
-
-
-def require_enough(trajectory: Trajectory, num: int, kind: ObservedKind) -> None:
+def require_enough(trajectory: Trajectory, num: int, kind: type[Observed]) -> None:
     """Raise GeometryError if there are too few photos to compare with, or no observation."""
     if len(trajectory) < MIN_NUM_KEYFRAMES or not num:
         raise GeometryError(
@@ -148,31 +113,29 @@ def path_to_search(trajectory: Trajectory, antennas_in_cam_m: Array, association
     return moving_path(trajectory, antennas_in_cam_m, association.model_copy(update={"max_interpolation_gap_s": gap_s}))
 
 
-def offset_of_motion(
-    observed: Observed, path: PathSamples, kind: ObservedKind, *, seed: int, progress: Progress
-) -> TimeOffset:
+def offset_of_motion(observed: Observed, path: PathSamples, *, seed: int, progress: Progress) -> TimeOffset:
     """Estimate the offset from motion: scan all offsets, refine the best few, and find out which of them are likely.
 
     Args:
-        observed: of this kind, with times. path: to search.
+        observed: what the offset is found from. path: to search.
         seed, progress: as for ``estimate_time_offset``.
 
     Raises:
         GeometryError: the motion does not determine the offset, not even up to a few alternatives.
     """
-    name, remedy, times_s = kind.name, kind.remedy, observed.times_s
+    name, remedy, times_s = observed.name, observed.remedy, observed.times_s
     if np.count_nonzero(path.is_known) < 2:
         raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {remedy}")
     # All offsets use observations in the same random order, so that different offsets are compared by the same ones.
     mixed = observed.take(np.random.default_rng(seed).permutation(len(times_s)))
-    candidates = kind.scan(observed, path, None).peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
+    candidates = observed.scan(path, observed.start_weights).peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
-        near = on_path(mixed, path, offset_s, _NUM_PER_CANDIDATE)
+        near = mixed.on_path(path, offset_s, _NUM_PER_CANDIDATE)
         if len(near.times_s):
             best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
-            fits.append(refine_offset(near, path, offset_s, best, kind.fit_at))
+            fits.append(refine_offset(near, path, offset_s, best))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         log_s, photos_s = np.ptp(times_s), path.step_s * (len(path.is_known) - 1)
@@ -186,8 +149,8 @@ def offset_of_motion(
             f"at no time offset do the {name} follow the camera's path (it hardly moves, its photos are "
             f"too far apart, or the log belongs to other photos): {remedy}"
         )
-    near = on_path(mixed, path, best.offset_s, _NUM_OF_FINAL)
-    final, found = kind.fit_clocks(near, path, best.offset_s)
+    near = mixed.on_path(path, best.offset_s, _NUM_OF_FINAL)
+    final, found = fit_clocks(near, path, best.offset_s)
     is_certain = bool(found.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
     said = f"(about {final.offset_s:+.2f} s, within {NORMAL_95 * found.stddev_s:.2g} s, 95 %)"
     if not is_certain and not found.stddev_s < _MOST_UNCERTAIN_S:
@@ -195,7 +158,7 @@ def offset_of_motion(
     uneven = f"the motion is too even to tell the time offset well {said}: {remedy} if you know it better"
     found = replace(
         found,
-        curve=kind.scan(final.observed, path, final.weights).around(final.offset_s),
+        curve=final.observed.scan(path, final.weights).around(final.offset_s),
         note="; ".join(filter(None, (found.note, None if is_certain else uneven))) or None,
         probability=probability,
         is_certain=is_certain,
@@ -212,7 +175,7 @@ def _offset_of_bursts(
     if not best.explains():
         raise GeometryError(
             f"at no time offset do the {len(bursts.start_s)} bursts of ranges fit the {len(trajectory)} photos "
-            f"better than by chance: {REMEDY}"
+            f"better than by chance: {TimedRanges.remedy}"
         )
     likely = likely_offsets([each.offset_s for each in pairings], [-best.log_odds(each) for each in pairings])
     earliest_s, latest_s = offsets_that_keep(best, bursts, trajectory)
@@ -246,7 +209,7 @@ def _num_at_same_photo(log: RangeLog, trajectory: Trajectory, association: Range
 
 
 def likely_offsets(
-    offsets_s: Sequence[float], log_likelihoods: Sequence[float], remedy: str = REMEDY
+    offsets_s: Sequence[float], log_likelihoods: Sequence[float], remedy: str = TimedRanges.remedy
 ) -> list[tuple[int, float]]:
     """Return the indices and probabilities of the offsets that cannot be ruled out, the most likely first.
 
