@@ -47,7 +47,7 @@ class Commands(Parser):
             "  rangesfm COMMAND -h      what most people need of a command\n"
             "  rangesfm COMMAND --help  everything about it; options may be spelt with _ or -",
         )
-        self.more = None
+        self.more = ""
         version = f"rangesfm {__version__}"
         self.general.add_argument("--version", action="version", version=version, help="print the version")
         self.by_name: dict[str, Parser] = {}

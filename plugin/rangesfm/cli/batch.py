@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 import time
@@ -119,7 +120,7 @@ class BatchTerminal:
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
         self._screen = Screen(stream, quiet=quiet)
         self._clock = clock
-        self._last_drawn: float | None = None
+        self._last_drawn = -math.inf
         self._told: dict[int, str] = {}
         self._num_over = 0
 
@@ -129,7 +130,7 @@ class BatchTerminal:
         now = self._clock()
         if new or batch_state.is_over:
             self._screen.say(new)
-        if not batch_state.is_over and (new or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S):
+        if not batch_state.is_over and (new or now - self._last_drawn >= _INTERVAL_S):
             self._last_drawn = now
             self._screen.draw(_going_on(batch_state))
 

@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, add_help=False, **options)
         self.color = False  # with colours, those of Python 3.14, the text would contain control characters
         self.common: set[str] = set()
-        self.more: str | None = f"everything:\n  {self.prog} --help"
+        self.more = f"everything:\n  {self.prog} --help"
         self.later: list[Callable[[Parser], object]] = []
         self.general = self.add_argument_group("general")
         self.general.add_argument("-h", "--help", action=PrintHelp)
@@ -84,7 +84,7 @@ class Parser(argparse.ArgumentParser):
             formatter.add_arguments(actions)
             formatter.end_section()
         formatter.add_text(self.epilog)
-        formatter.add_text(None if is_full else self.more)
+        formatter.add_text("" if is_full else self.more)
         return formatter.format_help()
 
     def help_sections(self, *, is_full: bool) -> list[HelpSection]:

@@ -98,7 +98,7 @@ class TerminalProgress(Progress):
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
         self._screen = Screen(stream, quiet=quiet)
         self._clock = clock
-        self._stage: str | None = None
+        self._stage = ""  # none yet, or it has ended
         self._stage_start = self._last_update = clock()
 
     def stage(self, name: str) -> None:
@@ -112,7 +112,7 @@ class TerminalProgress(Progress):
         if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._screen.is_terminal else _PLAIN_INTERVAL_S):
             self._last_update = now
             taken_s = 0.0 if self._stage in _GROWING_STAGES else now - self._stage_start
-            self._show(f"{self._stage or ''} {counts(num_done, num_total, taken_s)}".strip())
+            self._show(f"{self._stage} {counts(num_done, num_total, taken_s)}".strip())
 
     def message(self, text: str) -> None:
         self._screen.say([text])
@@ -121,8 +121,8 @@ class TerminalProgress(Progress):
         """Print that the current stage, if there is one, has ended."""
         ending = "stopped after " if failed else ""
         line = f"{self._stage}: {ending}{format_duration(self._clock() - self._stage_start)}"
-        self._screen.say([] if self._stage is None else [line])
-        self._stage = None
+        self._screen.say([line] if self._stage else [])
+        self._stage = ""
 
     def _show(self, line: str) -> None:
         (self._screen.draw if self._screen.is_terminal else self._screen.say)([line])
