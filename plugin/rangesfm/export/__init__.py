@@ -76,7 +76,7 @@ EXPORTERS: dict[str, tuple[tuple[str, ...], Exporter]] = {
     "kml": (("survey.kml",), partial(write_features, driver="KML")),
     "transform": (
         ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
-        lambda map_, path: write_transform(map_.metric_from_sfm, path.parent),
+        lambda map_, path: write_transform(map_, path.parent),
     ),
     "model_aligner": (("positions.txt",), lambda map_, path: write_camera_positions(map_.reconstruction, path)),
     "pose_priors": (("pose_priors.db",), write_pose_priors),

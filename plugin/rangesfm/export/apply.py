@@ -101,8 +101,8 @@ def _sfm_from_file(path: Path, sfm: pycolmap.Reconstruction, metric: Sequence[py
     kind = _kind_of(path)
     if kind.says_metres(path):
         raise InputError(f"says that it is in metres already, {_UNSCALED}", path)
-    if kind.cameras is not None:
-        cameras, of_sfm = kind.cameras(path), _cameras_of(sfm)
+    if (cameras := kind.cameras(path)).names:
+        of_sfm = _cameras_of(sfm)
         if len(pairs := cameras.pairs_with(of_sfm)) >= _MIN_NUM_CAMERAS:
             return _by_cameras(path, cameras, of_sfm, pairs, [_cameras_of(each) for each in metric])
         places, what = cameras.centers, "cameras"
@@ -256,11 +256,11 @@ def _cameras_of(model: pycolmap.Reconstruction) -> _Cameras:
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of file: how to transform it, and its cameras or else its vertices (n, 3)."""
+    """A kind of file: how to transform it, and its cameras or, if it has none, its vertices (n, 3)."""
 
     transform: Callable[[Path, Similarity, Path], Path]
     vertices: Callable[[Path], Array] = lambda path: np.zeros((0, 3))
-    cameras: Callable[[Path], _Cameras] | None = None
+    cameras: Callable[[Path], _Cameras] = lambda path: _Cameras((), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     says_metres: Callable[[Path], bool] = lambda path: False
 
 
@@ -277,12 +277,12 @@ def _kind_of(path: Path) -> _Kind:
 _IN_METRES = "# metres"
 
 
-def _lines_of_obj(path: Path, new_from_old: Similarity) -> Iterator[tuple[str, Array | None]]:
-    """Yield each line of an OBJ file, with the transformed vertex or normal (3,) if it is one."""
+def _lines_of_obj(path: Path, new_from_old: Similarity) -> Iterator[tuple[str, Array]]:
+    """Yield each line of an OBJ file, with the transformed vertex or normal (3,), or (0,) if it is neither."""
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if words[:1] not in (["v"], ["vn"]):
-            yield line, None
+            yield line, np.zeros(0)
             continue
         try:
             at: Array = np.array([float(word) for word in words[1:4]]).reshape(3)
@@ -299,17 +299,16 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
     """Transform vertices and normals of an OBJ file; faces, colours and all else are copied unchanged."""
     lines = [_IN_METRES]
     for line, moved in _lines_of_obj(path, metric_from_sfm):
-        if moved is None:
-            lines.append(line)
-        else:
+        if len(moved):
             name, _, _, _, *others = line.split()
-            lines.append(" ".join([name, *(f"{value:.10g}" for value in moved), *others]))
+            line = " ".join([name, *(f"{value:.10g}" for value in moved), *others])
+        lines.append(line)
     write_text("\n".join(lines) + "\n", target)
     return target
 
 
 def _vertices_of_obj(path: Path) -> Array:
-    rows = [at for line, at in _lines_of_obj(path, IDENTITY) if at is not None and line.split()[0] == "v"]
+    rows = [at for line, at in _lines_of_obj(path, IDENTITY) if line.split()[:1] == ["v"]]
     return np.array(rows).reshape(-1, 3)
 
 

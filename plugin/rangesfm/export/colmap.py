@@ -16,7 +16,6 @@ from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, photo_files, registered_images, require_space
 from rangesfm.util.files.atomic import new_file, new_folder, write_text
 from rangesfm.util.files.folders import real_path
-from rangesfm.util.geometry.similarity import Similarity
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:
@@ -49,7 +48,7 @@ def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path
     return path
 
 
-def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[Path, Path]:
+def write_transform(map_: MetricMap, folder: Path) -> tuple[Path, Path]:
     """Write metric_from_sfm for COLMAP's ``model_transformer``, with all digits, in both forms that COLMAP has had.
 
     ``transform_colmap_4.txt`` has ``scale qw qx qy qz tx ty tz`` on one line, for COLMAP from 3.9 on;
@@ -59,6 +58,7 @@ def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[P
     Raises:
         InputError: the similarity is not known.
     """
+    metric_from_sfm = map_.metric_from_sfm
     if metric_from_sfm is None:
         raise InputError("the format 'transform' needs metric_from_sfm, which is not known for this model")
     qx, qy, qz, qw = Rotation.from_matrix(metric_from_sfm.rotation).as_quat()

@@ -42,7 +42,8 @@ def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
 
 def write_cameras(trajectory: Trajectory, path: Path) -> Path:
     """Write one vertex at each camera centre; its normal is the viewing direction."""
-    return _write_vertices(path, trajectory.centers, CAMERA_COLOR, normals=trajectory.world_from_cam[:, :, 2])
+    normals = dict(zip(("nx", "ny", "nz"), trajectory.world_from_cam[:, :, 2].T.astype("<f4")))
+    return _write_vertices(path, trajectory.centers, CAMERA_COLOR, **normals)
 
 
 def write_anchor_vertices(anchors_m: Mapping[str, Array], path: Path) -> Path:
@@ -53,15 +54,14 @@ def write_anchor_vertices(anchors_m: Mapping[str, Array], path: Path) -> Path:
 
 
 def _write_vertices(
-    path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str = ""
+    path: Path, xyz: Array, colors: npt.ArrayLike, comment: str = "", **others: npt.NDArray[Any]
 ) -> Path:
-    """Write vertices with positions (n, 3), colours (n, 3) or one for all, and perhaps normals (n, 3).
+    """Write vertices with positions (n, 3), colours (n, 3) or one for all, and other columns (n,) by name.
 
     Positions are written in double precision, because single precision loses millimetres far from the origin.
     """
     columns: dict[str, npt.NDArray[Any]] = dict(zip("xyz", xyz.T.astype("<f8")))
-    if normals is not None:
-        columns |= zip(("nx", "ny", "nz"), normals.T.astype("<f4"))
+    columns |= others
     columns |= zip(("red", "green", "blue"), np.broadcast_to(np.asarray(colors, dtype=np.uint8), xyz.shape).T)
     kind = [(name, values.dtype) for name, values in columns.items()]
     vertices = np.rec.fromarrays(columns.values(), dtype=kind)
