@@ -106,7 +106,8 @@ def close_in_graph(problem: MapProblem, known: MapProblem, rays: Observations, l
         rays: all observations of the photos. loops: by indices in ``problem.frame_ids``.
     """
     graph = _graph(known, rays, known.start.blocks, loops)
-    fit = _solve_precisely(graph, known, graph.start)
+    # A bundle adjustment follows in any case. More precisely, the graph takes tens of steps along weak modes.
+    fit = solve_graph(graph, graph.start, tolerance_m=NEGLIGIBLE_STDDEVS * known.smallest_stddev)
     before, after = graph.vision.origin.centers, fit.state.poses.centers
     if farthest(align_points(before, after).apply(before), after) <= _NUM_VISIBLE_STDDEVS * problem.visible_m:
         return None

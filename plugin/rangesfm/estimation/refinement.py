@@ -49,7 +49,7 @@ class MapAtRest:
     Attributes:
         problem: with the noise of the measurements at the end.
         state: of the map. blocks: its parameter blocks, to which the equations refer.
-        equations: of photos and all measurements; None if the photos are too many.
+        equations: of photos and all measurements; None if the photos are too many, or if they were not asked for.
         refined_params: which parameters of each camera are adjusted, by its id.
         firm_ids: of the frames that the photos hold together, which are the map as a whole.
         pixel_stddev: standard deviation of a reprojection error's coordinate before the solution, the unit of the
@@ -83,17 +83,20 @@ class MapAtRest:
         return self.solutions[-1].converged and self.is_still
 
 
-def refine(problem: MapProblem) -> MapAtRest:
+def refine(problem: MapProblem, *, with_equations: bool = True) -> MapAtRest:
     """Refine a model in place, and return it at rest.
 
     Misplaced points (see ``misplaced_points``), as wrong matches make them, do not take part.
+
+    Args:
+        with_equations: whether to set up the equations at rest.
 
     Raises:
         SolverError: the solver failed. InputError: an option passed through to COLMAP is unknown.
     """
     with _marks_in_map(problem) as marked:
         marked, adjustment, rays = _without_misplaced(marked)
-        return _adjusted(adjustment, straighten(marked, rays))
+        return _adjusted(adjustment, straighten(marked, rays), with_equations=with_equations)
 
 
 @contextmanager
@@ -122,6 +125,8 @@ def refine_with_loops(
     known: MapProblem,
     loops: LoopPoses,
     merge_tracks: Callable[[pycolmap.Reconstruction], None],
+    *,
+    with_equations: bool = True,
 ) -> MapAtRest | None:
     """Move a refined model so that its loops close, in place, and refine it again; None where they are closed already.
 
@@ -129,6 +134,7 @@ def refine_with_loops(
         problem, known: with the noise to begin with, and with which the model was refined.
         loops: measured relative poses, by ids of frames in place of indices.
         merge_tracks: makes one point of those that two passes saw apart, in place.
+        with_equations: as for ``refine``.
     """
     place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
     reference, frame = (
@@ -148,7 +154,7 @@ def refine_with_loops(
         solve_bundle_adjustment(adjustment, marked.visible_m)
         blocks = problem.state(added).blocks
     merge_tracks(problem.metric)
-    return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)))
+    return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)), with_equations=with_equations)
 
 
 def _just_visible_m(rays: Observations, poses: Poses) -> float:
@@ -157,7 +163,7 @@ def _just_visible_m(rays: Observations, poses: Poses) -> float:
     return float(np.median(np.abs(in_cam[:, 2]) / rays.root_information))
 
 
-def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
+def _adjusted(adjustment: BundleAdjustment, start: Straightened, *, with_equations: bool) -> MapAtRest:
     """Alternate between solving the full problem and estimating the noise from its residuals."""
     problem, blocks = start.problem, start.blocks
     solutions: list[SolverRun] = []
@@ -183,7 +189,7 @@ def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
         problem=problem,
         state=problem.state(added),
         blocks=added,
-        equations=equations_of(adjustment, added) if adjustment.has_covariance else None,
+        equations=equations_of(adjustment, added) if with_equations and adjustment.has_covariance else None,
         refined_params=adjustment.refined_params,
         firm_ids=frames_of_largest_part(problem.metric),
         pixel_stddev=adjustment.pixel_stddev,

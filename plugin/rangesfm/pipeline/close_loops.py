@@ -39,6 +39,7 @@ from rangesfm.sfm.steps import DATABASE_NAME, MODELS_NAME, Workspace
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.output_folder import OutputFolder, sole_writer
+from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def close_loops_of_models(
             with journal.stage("refinement"):
                 path = trajectory_from_reconstruction(models[0])
                 at_rest = refine(_problem(survey, path, models[0], is_refined=False))
-            start = _UnscaledMap(survey, journal, matching, path, at_rest)
+            start = _UnscaledMap(survey, journal, matching, path, at_rest, _errors_alone(at_rest))
             if start.finder is None:
                 raise GeometryError("the covariance of the poses is not known")
             last, tried = close_in_rounds(start)
@@ -165,8 +166,12 @@ class _MatchedMap(ABC):
         """What shows that the map is broken; empty if nothing does."""
 
     @abstractmethod
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> Self | None:
-        """Return the map refined with loops, relative poses by ids of frames; None if they are closed in it."""
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> Self | None:
+        """Return the map refined with loops, relative poses by ids of frames; None if they are closed in it.
+
+        Args:
+            is_last: whether no more loops are to be proposed in that map.
+        """
 
     def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
         """Return pairs of photos that look alike; arguments as of ``find_in``."""
@@ -188,7 +193,7 @@ class _MatchedMap(ABC):
                 merge_tracks(model, self.matching.database, seed=self.survey.output.seed)
 
         with self.journal.stage("refinement"):
-            closed = self.with_loops(self.finder.relative_poses(loops), merge)
+            closed = self.with_loops(self.finder.relative_poses(loops), merge, is_last=not tried.promise_more)
         if closed is not None and (why := closed.why_broken):
             self.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
             return None
@@ -222,7 +227,8 @@ class _MetricMap(_MatchedMap):
     def why_broken(self) -> tuple[str, ...]:
         return () if self.metric.refined is None else self.metric.refined.why_broken
 
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _MetricMap | None:
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> _MetricMap | None:
+        del is_last
         closed = refine_closed_map(self.run, self.metric, loops, merge)
         return None if closed is None else replace(self, metric=closed)
 
@@ -233,10 +239,12 @@ class _UnscaledMap(_MatchedMap):
 
     Attributes:
         trajectory: of its keyframes. at_rest: the model, with no measurements but its photos.
+        errors: of its poses; of the last map those before its loops were closed, which were larger. None: not known.
     """
 
     trajectory: Trajectory
     at_rest: MapAtRest
+    errors: MapErrors | None
 
     @property
     def model(self) -> pycolmap.Reconstruction:
@@ -244,25 +252,31 @@ class _UnscaledMap(_MatchedMap):
 
     @cached_property
     def finder(self) -> LoopFinder | None:
-        # The map is bent as much as photos usually bend maps, since nothing tells how much.
-        found, at_rest, seed = joint_errors(self.at_rest, LARGEST_FACTOR), self.at_rest, self.survey.output.seed
-        if found is None:
+        if self.errors is None:
             return None
-        return LoopFinder.in_refined_map(self.model, self.trajectory, found, at_rest.pixel_stddev, seed)
+        pixel_stddev, seed = self.at_rest.pixel_stddev, self.survey.output.seed
+        return LoopFinder.in_refined_map(self.model, self.trajectory, self.errors, pixel_stddev, seed)
 
     @property
     def why_broken(self) -> tuple[str, ...]:
         errors = point_errors(self.model)
         return () if errors.fit else (errors.apart("the refined map"),)
 
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _UnscaledMap | None:
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> _UnscaledMap | None:
         problem = _problem(self.survey, self.trajectory, self.model, is_refined=True)
-        rest = refine_with_loops(problem, problem, loops, merge)
-        return None if rest is None else replace(self, at_rest=rest)
+        rest = refine_with_loops(problem, problem, loops, merge, with_equations=not is_last)
+        if rest is None:
+            return None
+        return replace(self, at_rest=rest, errors=self.errors if is_last else _errors_alone(rest))
 
     def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
         matching = self.matching
         return pairs_alike(matching.database, known, matching.log, max_num=1, seed=self.survey.output.seed)
+
+
+def _errors_alone(at_rest: MapAtRest) -> MapErrors | None:
+    """Return the errors of a map that is bent as much as photos usually bend maps, since nothing tells how much."""
+    return joint_errors(at_rest, LARGEST_FACTOR)
 
 
 def _problem(survey: Survey, path: Trajectory, model: pycolmap.Reconstruction, *, is_refined: bool) -> MapProblem:
