@@ -107,7 +107,7 @@ def close_in_graph(problem: MapProblem, known: MapProblem, rays: Observations, l
     """
     graph = _graph(known, rays, known.start.blocks, loops)
     # A bundle adjustment follows in any case. More precisely, the graph takes tens of steps along weak modes.
-    fit = solve_graph(graph, graph.start, tolerance_m=NEGLIGIBLE_STDDEVS * known.smallest_stddev)
+    fit = solve_graph(graph, graph.start, tolerance_m=problem.visible_m)
     before, after = graph.vision.origin.centers, fit.state.poses.centers
     if farthest(align_points(before, after).apply(before), after) <= _NUM_VISIBLE_STDDEVS * problem.visible_m:
         return None

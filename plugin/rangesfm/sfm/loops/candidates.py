@@ -153,13 +153,12 @@ def predicted_overlaps(
 def _unknown_px(views: Views, errors: RelativeErrors, first: int, others: Indices) -> Array:
     """Return the (k,) standard deviations with which the map predicts, in k photos, the target of one photo."""
     target = np.median(views.points[first], axis=0)
-    covariance = errors.covariances(int(views.frame[first]), views.frame[others])
     arm = target - errors.centers[views.frame[others]]
     by_pose = np.concatenate([-cross_matrices(arm), np.tile(np.eye(3), (len(others), 1, 1))], axis=2)
-    moved = by_pose @ covariance @ np.swapaxes(by_pose, 1, 2)
+    variance = errors.variances(int(views.frame[first]), views.frame[others], by_pose)
     distance = np.linalg.norm(target - views.centers[others], axis=1)
     focal = views.focal_px[others].mean(axis=1)
-    return np.asarray(focal / distance * np.sqrt(np.trace(moved, axis1=1, axis2=2) / 3))
+    return np.asarray(focal / distance * np.sqrt(variance / 3))
 
 
 def _best_apart(

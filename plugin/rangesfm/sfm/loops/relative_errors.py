@@ -46,12 +46,16 @@ class RelativeErrors:
         carried[:, 3:, :3] = -cross_matrices(self.centers[others] - self.centers[held])
         return carried
 
-    def covariances(self, held: int, others: Indices) -> Array:
-        """Return the (k, 6, 6) covariances of k keyframes where keyframe ``held`` and what it sees are exact."""
-        carried = self.carried(held, others)
-        modes = self.frames.modes[others] - carried @ self.frames.modes[held]
-        rest = carried @ self.frames.rests[held] @ np.swapaxes(carried, 1, 2)
-        return np.asarray(modes @ np.swapaxes(modes, 1, 2) + rest + self.frames.rests[others])
+    def variances(self, held: int, others: Indices, by_frame: Array) -> Array:
+        """Return the (k,) total variances of what depends on k keyframes, where keyframe ``held`` is exact.
+
+        Args:
+            by_frame: (k, d, 6) derivatives of d numbers by each of the keyframes.
+        """
+        by_held = by_frame @ self.carried(held, others)
+        modes = by_frame @ self.frames.modes[others] - by_held @ self.frames.modes[held]
+        rests = by_frame @ self.frames.rests[others] * by_frame + by_held @ self.frames.rests[held] * by_held
+        return np.asarray(np.sum(modes**2, axis=(1, 2)) + np.sum(rests, axis=(1, 2)))
 
     def covariance(self, frames: Indices, by_frame: Array) -> Array:
         """Return the (6, 6) covariance of what depends on the errors of k keyframes.
