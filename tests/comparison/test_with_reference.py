@@ -175,10 +175,9 @@ def test_the_reference_in_the_maps_frame_lies_on_a_perfect_path() -> None:
     truth = make_path(*walk())
     path = in_first_camera(truth)
     carried = reference_in_frame(path, reference_of(truth), frame="first_camera")
-    assert carried is not None
     assert carried.image_names == path.image_names
     np.testing.assert_allclose(carried.positions_m, path.centers, atol=1e-9)
-    assert reference_in_frame(path, reference_of(truth, has_rotations=False), frame="first_camera") is None
+    assert not len(reference_in_frame(path, reference_of(truth, has_rotations=False), frame="first_camera"))
 
 
 def test_the_printed_table_has_a_dash_for_what_is_not_known() -> None:

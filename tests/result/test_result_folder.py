@@ -122,7 +122,7 @@ def test_anchors_and_lever_arms_are_arrays(tmp_path: Path) -> None:
 def test_what_a_run_did_not_leave_is_empty_or_none(tmp_path: Path) -> None:
     result = read_result_folder(write_document(tmp_path))
     assert [len(result.read(table)) for table in RESULT_TABLES] == [0] * len(RESULT_TABLES)
-    assert (result.read_reference(), result.read_metric_model()) == (None, None)
+    assert (len(result.read_reference()), result.read_metric_model()) == (0, None)
     assert (result.timestamps_s, result.images_path) == (None, None)
 
 

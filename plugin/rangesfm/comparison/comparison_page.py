@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.comparison.many_models import ModelsComparison, NamedModel
-from rangesfm.comparison.same_photos import carried_by
 from rangesfm.export.metric_map import colored_points
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
@@ -27,7 +26,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
         InputError: the folder cannot be written to, or a run is writing there.
     """
     base, path = comparison.rows[0].model, folder / "comparison.html"
-    aligned = [carried_by(row.base_from_model, row.model.path) for row in comparison.rows]
+    aligned = [row.aligned for row in comparison.rows]
     title = f"{len(aligned)} models of {len(base.path)} photos"
     frame = base.frame or "first_camera"
     similarity, *lengths, truth = comparison.tables

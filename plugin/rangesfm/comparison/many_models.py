@@ -85,6 +85,12 @@ class ModelRow:
     range_rms_m: tuple[float, float]
 
     @property
+    def aligned(self) -> Trajectory:
+        """Return the path after that similarity, or as it is without one."""
+        path = self.model.path
+        return path if self.base_from_model is None else carried_by(self.base_from_model, path)
+
+    @property
     def scale_ratio(self) -> float:
         """Return the lengths in the model divided by those in the first model; NaN without a similarity."""
         return math.nan if self.base_from_model is None else 1.0 / self.base_from_model.scale

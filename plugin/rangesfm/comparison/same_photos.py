@@ -23,10 +23,8 @@ def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...
     return tuple(first.image_names[i] for i in ours), first.centers[ours], second.centers[theirs]
 
 
-def carried_by(similarity: Similarity | None, path: Trajectory) -> Trajectory:
-    """Return a path transformed by a similarity, or unchanged where that is None."""
-    if similarity is None:
-        return path
+def carried_by(similarity: Similarity, path: Trajectory) -> Trajectory:
+    """Return a path transformed by a similarity."""
     return path.transformed(similarity.scale, similarity.rotation, similarity.translation)
 
 

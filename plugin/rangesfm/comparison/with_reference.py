@@ -90,17 +90,16 @@ def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "sit
     return path if found is None else path.resized(found.scale, frame)
 
 
-def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str) -> Reference | None:
+def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str) -> Reference:
     """Return the reference positions of a path's keyframes by photo, in the world of the path, without fitting.
 
-    Returns:
-        None where the reference has no keyframe of the path, or its relation to the frame of the path is unknown (see
-        ``compare``).
+    It is empty where the reference has no keyframe of the path, or its relation to the frame of the path is unknown
+    (see ``compare``).
     """
     known, target, world_from_cam = known_keyframes(path, reference)
     positions = _in_frame(path, known, target, world_from_cam, frame)
-    if positions is None or len(known) == 0:
-        return None
+    if positions is None:
+        return Reference(np.zeros((0, 3)), image_names=())
     return Reference(positions, image_names=tuple(path.image_names[i] for i in known))
 
 

@@ -109,7 +109,7 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
     rows = papers_table(paths, inputs.reference, frame=frame)
     *_, final = paths.values()
     in_frame = reference_in_frame(final, inputs.reference, frame=frame)
-    if in_frame is not None:
+    if len(in_frame):
         write_reference(in_frame, folder / REFERENCE_NAME)
     return rows
 

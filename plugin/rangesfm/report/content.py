@@ -97,8 +97,8 @@ class Content:
         self.point_ids = np.array(sorted(final.point3D_ids()), dtype=np.int64)
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
-        self.reference_m = reference.positions_m if reference else np.zeros((0, 3))
-        self.reference_by_photo = dict(zip(reference.image_names or (), self.reference_m)) if reference else {}
+        self.reference_m = reference.positions_m
+        self.reference_by_photo = dict(zip(reference.image_names or (), self.reference_m))
 
     @cached_property
     def true_scale(self) -> Trajectory:

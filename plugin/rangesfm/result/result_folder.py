@@ -125,10 +125,10 @@ class ResultFolder:
         """Read how the parts of the refined map err together; None if that is not known."""
         return read_map_errors(self.path)
 
-    def read_reference(self) -> Reference | None:
-        """Read the reference positions of the photos, in the world of the metric models; None if there are none."""
+    def read_reference(self) -> Reference:
+        """Read the reference positions of the photos, in the world of the metric models; empty if there are none."""
         path = self.path / REFERENCE_NAME
-        return read_reference(path) if path.is_file() else None
+        return read_reference(path) if path.is_file() else Reference(np.zeros((0, 3)), image_names=())
 
     def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
         """Read the model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
