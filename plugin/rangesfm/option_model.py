@@ -111,9 +111,9 @@ class Key:
 class Options(BaseModel):
     """A table of options, or a part of one. Its values are checked when it is made, and cannot be changed.
 
-    A derived class gives the table's name in a survey file: ``class ScaleOptions(Options, table="scale")``. The
-    docstring under each field is the explanation that users read in the help, on the page of keys and in new survey
-    files.
+    A key that is None has its default. A derived class gives the table's name in a survey file: ``class
+    ScaleOptions(Options, table="scale")``. The docstring under each field is the explanation that users read in the
+    help, on the page of keys and in new survey files.
 
     Raises:
         OptionError: an unknown key (the text names the nearest known one), or a value of the wrong type or out of
@@ -131,6 +131,7 @@ class Options(BaseModel):
         cls.table = table or cls.table
 
     def __init__(self, /, **values: Any):
+        values = {name: value for name, value in values.items() if value is not None}  # None: it is not given
         try:
             super().__init__(**values)
         except ValidationError as error:
