@@ -124,7 +124,9 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     may_be = bool(ids) and (
         num_axes == 3 or (is_named and num_axes == 2) or (bool(degrees) and bool(is_named or axes["z"]))
     )
-    if _is_of_times(layout, ids) or not (may_be or (is_about_anchors and _has_numbers(layout))):
+    if _is_of_times(layout, ids) or not (
+        may_be or (is_about_anchors and any(column.kind == "numbers" for column in layout.columns))
+    ):
         return None
     columns = {quantity: those[0].name for quantity, those in found.items() if those}
     doubts, choices = [], list[Choice]()
@@ -256,10 +258,6 @@ def _is_of_times(layout: Layout, ids: Sequence[ColumnSample]) -> bool:
     has_times = layout.has_names and any(map(is_named_time, layout.columns))
     is_of_ranges = any(map(is_range, layout.columns))
     return has_times and (is_of_ranges or not ids or ids[0].num_distinct < len(ids[0].cells))
-
-
-def _has_numbers(layout: Layout) -> bool:
-    return any(column.kind == "numbers" for column in layout.columns)
 
 
 def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[tuple[str, list[Choice]]]:

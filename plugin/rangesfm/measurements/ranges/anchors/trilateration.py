@@ -274,7 +274,9 @@ def _conclude(anchor: AnchorRanges, found: JudgedFit, options: TrilaterationOpti
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
         apart = (mirror - found.fit.x)[:3]
-        told = _unless_along_plane(anchor.toward, apart)
+        # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
+        least = UNDETERMINED * float(np.linalg.norm(anchor.toward) * np.linalg.norm(apart))
+        told = anchor.toward if abs(anchor.toward @ apart) > least else None
         # If both have the same cost, the choice would depend on rounding, so the order is fixed.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
@@ -399,10 +401,3 @@ def _gap(found: JudgedFit, mirror: Array) -> float:
     inflation = found.inflation(problem.residuals_m(mirror) - found.fit.residuals_m)
     judged = found.judged_by(inflation)
     return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
-
-
-def _unless_along_plane(direction: Array, across: Array) -> Array | None:
-    """Return the direction if it selects one of two mirror images, or None if it is along the plane between them."""
-    # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
-    least = UNDETERMINED * float(np.linalg.norm(direction) * np.linalg.norm(across))
-    return direction if abs(direction @ across) > least else None

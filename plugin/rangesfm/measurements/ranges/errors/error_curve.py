@@ -51,17 +51,13 @@ class ErrorCurve:
         beyond = np.abs(np.log(distance / np.clip(distance, self.distance_m[0], self.distance_m[-1])))
         return distance, np.hypot(np.interp(range_m, knots, self.stddev_m), DRIFT_STDDEV_M * beyond)
 
-    def share_outside(self, range_m: Array) -> float:
-        """Return the share of ranges with lengths outside the curve."""
-        knots = self.distance_m + self.error_m
-        return float(np.mean((range_m < knots[0]) | (range_m > knots[-1]))) if len(range_m) else 0.0
-
 
 def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str]]:
     """Return the log with the error subtracted, and notes for the user."""
     distance, stddev = curve.true_distance(log.range_m)
-    notes = []
-    if (outside := curve.share_outside(log.range_m)) > _MUCH_OUTSIDE:
+    notes, knots = [], curve.distance_m + curve.error_m
+    is_outside = (log.range_m < knots[0]) | (log.range_m > knots[-1])
+    if len(log) and (outside := float(np.mean(is_outside))) > _MUCH_OUTSIDE:
         notes.append(
             f"{100 * outside:.0f} % of the ranges are shorter or longer than the {curve.distance_m[0]:.2f} to "
             f"{curve.distance_m[-1]:.2f} m at which the error curve was learnt: they weigh less"

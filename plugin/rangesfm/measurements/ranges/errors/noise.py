@@ -122,14 +122,18 @@ def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
 
 
 def shares_by_residuals(labels: Indices, scaled_residuals: Array, loss: RobustLoss) -> Array:
-    """Return the (n,) weight of each range besides its noise, from the correlation of ranges within a place.
+    """Return the (n,) weight of each range besides its noise, so that a place counts as much as the mean of its ranges.
+
+    The mean of c ranges with a correlation is worth c / (1 + correlation (c - 1)) independent ones. The weights are
+    normalised so that a weighted estimate's formal covariance is also right for independent errors.
 
     Args:
         labels: (n,) of places, counted from 0. scaled_residuals: (n,) in standard deviations.
         loss: that of the fit, which reduces outliers.
     """
     toned_down = scaled_residuals * loss.weights(scaled_residuals)
-    return shares_of_places(labels, correlation_in_place(toned_down, labels))
+    worth = 1 / (1 + correlation_in_place(toned_down, labels) * (np.bincount(labels)[labels] - 1))
+    return np.asarray(worth * (worth.sum() / np.sum(worth**2)), dtype=np.float64)
 
 
 def correlation_in_place(errors: Array, labels: Indices) -> float:
@@ -152,17 +156,6 @@ def correlation_in_place(errors: Array, labels: Indices) -> float:
     typical_count = len(errors) / num_places
     total = between + (typical_count - 1) * within
     return float(np.clip((between - within) / total, 0.0, 1.0)) if total > NO_ERROR**2 else 0.0
-
-
-def shares_of_places(labels: Indices, correlation: float) -> Array:
-    """Return the (n,) weight of each range so that a place counts as much as the mean of its ranges.
-
-    The mean of c ranges with this correlation is worth c / (1 + correlation (c - 1)) independent ones. The weights are
-    normalised so that a weighted estimate's formal covariance is also right for independent errors.
-    """
-    counts = np.bincount(labels)[labels]
-    worth = 1 / (1 + correlation * (counts - 1))
-    return np.asarray(worth * (worth.sum() / np.sum(worth**2)), dtype=np.float64)
 
 
 @dataclass(frozen=True)

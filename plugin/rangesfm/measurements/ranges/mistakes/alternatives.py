@@ -84,7 +84,9 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
 
 def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
-    arms = _lever_arms_m(on_map)
+    in_cam_m = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
+    tag_index = on_map.tag_index
+    arms = {on_map.tag_ids[k]: np.median(in_cam_m[tag_index == k], axis=0) for k in np.unique(tag_index)}
     for words, given in _AXES_OF_LEVER_ARM.items():
         axes = _turned(given, *_IN_CAMERA)
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
@@ -228,9 +230,3 @@ def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
     start = RangeState(replace(IDENTITY, scale=float(_SCALE_FACTORS[best])), heard, unknown.bias_mean_m)
     state = _roughly_solved(unknown, start).state
     return state.metric_from_model, state.anchors_m
-
-
-def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
-    """Return the lever arms as given, in the camera's frame, by tag id; the median over each tag's ranges."""
-    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
-    return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from rangesfm.measurements.ranges.mistakes.hypothesis import (
     Hypothesis,
     duration_s,
     is_given,
-    longer,
     longest_m,
     of_anchor_place,
     of_bins,
@@ -39,6 +39,17 @@ LARGEST_RIG_M = 3.0
 _MOST_WARMING_M = 5.0
 # Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.
 _MOST_BODY_M = 2.0
+
+
+def _lengthening(problem: Linearized, name: str, share: Array, **told: Any) -> Hypothesis:
+    """Return: ranges read too long by a size times a share (n,) of each; ``told``: further attributes."""
+    return Hypothesis(
+        name,
+        of_bins(problem, -problem.bins.mean(share)),
+        correction=lambda size: Correction(longer_m=size[0] * share),
+        is_linear=True,
+        **told,
+    )
 
 
 def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
@@ -100,15 +111,14 @@ def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Hypothesis:
-    return Hypothesis(
+    return _lengthening(
+        problem,
         kind,
-        of_bins(problem, -np.isin(problem.bins.anchor_index, anchors).astype(np.float64)),
+        np.isin(problem.on_map.problem.anchor_index, anchors).astype(np.float64),
         subject=subject,
         words=lambda size: f"the ranges to {whose} {too_long(size)}",
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
-        correction=longer(lambda: np.isin(problem.on_map.problem.anchor_index, anchors)),
         most=longest_m(problem, anchors),
-        is_linear=True,
         is_in_interval=True,
     )
 
@@ -132,30 +142,27 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
-    name, distance_m = problem.on_map.anchor_ids[k], problem.gradient.distance_m
-    is_of, of_ranges = problem.bins.anchor_index == k, problem.on_map.problem.anchor_index == k
-    mean = distance_m[is_of].mean()
+    name, distance_m = problem.on_map.anchor_ids[k], problem.on_map.gradient.distance_m
+    of_ranges, mean = (
+        problem.on_map.problem.anchor_index == k,
+        problem.gradient.distance_m[problem.bins.anchor_index == k].mean(),
+    )
 
     def words(size: Array) -> str:
         if 1 + size[0] < _STUCK:
             return f"the ranges to anchor {name} hardly change with the distance: they are always nearly the same"
         return f"the ranges to anchor {name} grow by {1 + size[0]:.2f} m for each metre of distance"
 
-    def level(size: Array) -> Correction:
-        grown_m = np.linalg.norm(problem.on_map.from_anchor_m, axis=1) - mean
-        return Correction(longer_m=np.where(of_ranges, size[0] * grown_m, 0.0))
-
-    return Hypothesis(
+    return _lengthening(
+        problem,
         "anchor range scale",
-        of_bins(problem, np.where(is_of, -distance_m + mean, 0.0)),
+        np.where(of_ranges, distance_m - mean, 0.0),
         subject=name,
         words=words,
         remedy="look at its ranges in the log, and leave it out (use_anchors)",
-        correction=level,
         most=_MOST_SHARE_OF_ANCHOR,
         unit="1",
         adoption=lambda _: Correction(left_out=np.flatnonzero(of_ranges)),
-        is_linear=True,
         is_in_interval=True,
     )
 
@@ -249,21 +256,20 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 
 def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the radio's delay changes steadily, by more than radios drift."""
-    of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
-    lasts, unit = float(np.ptp(of_ranges)), "m of the path" if problem.on_map.velocity is None else "s"
+    since = problem.on_map.time_s - problem.time_s.mean()
+    lasts, unit = float(np.ptp(since)), "m of the path" if problem.on_map.velocity is None else "s"
 
     def words(size: Array) -> str:
         how = "longer" if size[0] > 0 else "shorter"
         return f"the ranges get {how} and {how}, by about {abs(size[0]):.2f} m within {lasts:.0f} {unit}"
 
-    yield Hypothesis(
+    yield _lengthening(
+        problem,
         "radio drift",
-        of_bins(problem, -since / lasts),
+        since / lasts,
         words=words,
         remedy="let the radio warm up before the survey, or calibrate it at the end too",
-        correction=lambda size: Correction(longer_m=size[0] / lasts * of_ranges),
         most=_MOST_WARMING_M,
-        is_linear=True,
     )
 
 
@@ -271,14 +277,13 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: a person who carries the camera blocks the signals of anchors behind."""
     on_map = problem.on_map
     is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
-    yield Hypothesis(
+    yield _lengthening(
+        problem,
         "behind the camera",
-        of_bins(problem, -problem.bins.mean(is_behind.astype(np.float64))),
+        is_behind.astype(np.float64),
         words=lambda size: f"the ranges to anchors behind the camera {too_long(size)}",
         remedy="carry the tag above the head, or see what stands behind it",
-        correction=longer(lambda: is_behind),
         most=_MOST_BODY_M,
-        is_linear=True,
         max_unnoticed=MISMEASURED_M,
     )
 

@@ -139,7 +139,10 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
     causes = []
     factorized = Factorization(problem)
     for test in _varied(nominated):
-        again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
+        # Ranges between the true time of a mistake and a tried one fit neither way.
+        at_times = factorized.estimates([test.hypothesis, *test.hypothesis.refine_time()])
+        best = max(at_times, key=lambda each: each.statistic).hypothesis
+        again, deviance, state = _settled_test(problem, best)
         gain = before - deviance
         is_found = again.is_possible and bool(np.isfinite(deviance))
         # The first step of a nonlinear hypothesis says little about a large mistake, so it needs more than the penalty.
@@ -162,12 +165,6 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
     causes.sort(key=lambda cause: -cause.score)
     likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
     return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
-
-
-def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothesis:
-    """Return a hypothesis at the time that fits best; ranges between its true time and a tried one fit neither way."""
-    tests = factorized.estimates([hypothesis, *hypothesis.refine_time()])
-    return max(tests, key=lambda test: test.statistic).hypothesis
 
 
 def _varied(tests: Sequence[Test]) -> list[Test]:

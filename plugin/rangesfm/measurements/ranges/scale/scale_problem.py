@@ -183,12 +183,15 @@ def scale_problem(
     placed = known | (surveyed & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     bias_m = np.array([a.range_bias_m for a in in_log])
-    bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
+    stddevs_m = (a.range_bias_stddev_m for a in in_log)
+    bias_stddev_m = np.array([range_model.range_bias_stddev_m if each is None else each for each in stddevs_m])
     measured = [given.distances]
     if anchor_frame == "site" and not known.any():
         measured += _between_surveyed(in_log, surveyed & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
     measured.append(lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
+    distances = functools.reduce(LocatedDistances.joined, measured)
+    has_ends = np.append(heard | placed, True)[distances.anchor_pair].all(axis=1)  # the last is for points, of index -1
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], given.trajectory),
@@ -205,17 +208,11 @@ def scale_problem(
         common_bias_stddev_m=common_stddev_m,
         frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
         share=errors.share,
-        distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
+        distances=distances.subset(has_ends & ~distances.is_check),
         gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,
     )
     return ScaleProblem(given, ranges, errors, rows, bool(known.any()), tuple(notes), left_out)
-
-
-def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances:
-    """Return the distances to fit: no checks, and only between points or anchors in use."""
-    takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
-    return distances.subset(takes_part)
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:
@@ -228,10 +225,6 @@ def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> l
 
 def _position(anchor: Anchor) -> Array:
     return np.full(3, np.nan) if anchor.position_m is None else anchor.position_m
-
-
-def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
-    return range_model.range_bias_stddev_m if anchor.range_bias_stddev_m is None else anchor.range_bias_stddev_m
 
 
 def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indices, Mask]:
