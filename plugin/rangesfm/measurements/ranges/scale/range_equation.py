@@ -30,7 +30,7 @@ from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.util.geometry.rotations import left_jacobians
-from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,12 @@ class RangeState:
     def similarities(self) -> tuple[Similarity, ...]:
         """The metric_from_model of each model."""
         return self.metric_from_model, *self.others
+
+    def in_frame_of_model(self) -> RangeState:
+        """Return the state of one model carried into the frame of that model, in metres."""
+        placed = self.metric_from_model
+        anchors_m = replace(placed, scale=1.0).inverse().apply(self.anchors_m)
+        return RangeState(replace(IDENTITY, scale=placed.scale), anchors_m, self.bias_m)
 
     @property
     def of_models(self) -> tuple[RangeState, ...]:

@@ -18,7 +18,6 @@ from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
 from rangesfm.measurements.ranges.scale.solution import (
-    OpenPlaceError,
     Solution,
     solution_from,
     solve_scale,
@@ -51,15 +50,14 @@ class RangesToSolve(Located):
         path, distances = self.given.trajectory, with_lengths(self.given.distances, others)
         given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
         placement = placement_by(others, first_camera_from(path))
-        problem, why_open = scale_problem(given, placement), tuple[str, ...]()
-        try:
-            solution = solve_scale(problem)
-        except OpenPlaceError as error:
-            why_open = (f"the map gets metres, but no place in the site: {error}",)
+        problem, notes = scale_problem(given, placement), tuple[str, ...]()
+        solution = solve_scale(problem)
+        if solution.why_open:
+            notes = (f"the map gets metres, but no place in the site: {solution.why_open}",)
             problem = scale_problem(given, placement, place_is_open=True)
-            solution = solution_from(problem, error.in_first_camera)
+            solution = solution_from(problem, solution.fit.state.in_frame_of_model())
         told = RangeEstimate.begun(given.observations, given.range_model)
-        return RangeScale(problem, solution, path, 1.0, self.bending, told, why_open)
+        return RangeScale(problem, solution, path, 1.0, self.bending, told, notes)
 
 
 @dataclass(frozen=True)

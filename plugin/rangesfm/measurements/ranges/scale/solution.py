@@ -36,7 +36,7 @@ from rangesfm.measurements.ranges.scale.starts import (
 )
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
-from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
+from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, path_kind, path_shape
 
 # Number of fits, each with the errors that the one before shows.
 _NUM_ROUNDS = 2
@@ -65,21 +65,6 @@ WHY_SCALE_IS_OPEN = {
 """Reasons why another scale fits as well, and what to do about it, by the kind of path."""
 
 
-class OpenPlaceError(GeometryError):
-    """The map also fits in another place of the site, with the same scale.
-
-    Attributes:
-        in_first_camera: the fit, carried into the first camera's frame.
-    """
-
-    def __init__(self, text: str, fitted: RangeState):
-        super().__init__(text)
-        placed = fitted.metric_from_model
-        from_site = replace(placed, scale=1.0).inverse()
-        alone = Similarity(placed.scale, np.eye(3), np.zeros(3))
-        self.in_first_camera = RangeState(alone, from_site.apply(fitted.anchors_m), fitted.bias_m)
-
-
 @dataclass(frozen=True)
 class Solution:
     """A fit weighted by the noise level that it shows itself.
@@ -90,6 +75,7 @@ class Solution:
         errors: of the problem's ranges; every formal standard deviation must be multiplied by their inflation.
         noise_stddev_m: standard deviation of an ordinary range, estimated from the fit.
         rivals: states of other maps that fit worse, the likeliest first.
+        why_open: why the map also fits in another place of the site, with the same scale; empty if it does not.
     """
 
     problem: RangeProblem
@@ -97,13 +83,14 @@ class Solution:
     errors: RangeErrors
     noise_stddev_m: float
     rivals: tuple[RangeState, ...] = ()
+    why_open: str = ""
 
 
 def solve_scale(posed: ScaleProblem) -> Solution:
     """Solve from all starts, estimate the noise, and refuse if two different maps fit equally well.
 
     Raises:
-        GeometryError: nothing fits, or two different maps fit (OpenPlaceError: they have the same scale).
+        GeometryError: nothing fits, or two maps of different scales fit.
     """
     problem, errors = posed.ranges, posed.errors
     if problem.placement is not None:  # known positions say where the map is, so that there is nothing to search for
@@ -120,8 +107,9 @@ def solve_scale(posed: ScaleProblem) -> Solution:
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
     others = [solution.fit.state for solution in solutions[1:]]
-    refuse_ambiguity(solutions[0], others, camera_side)
-    return replace(solutions[0], rivals=tuple(each for each in others if is_on_side(problem, each, camera_side)))
+    why_open = refuse_ambiguity(solutions[0], others, camera_side)
+    rivals = tuple(each for each in others if is_on_side(problem, each, camera_side))
+    return replace(solutions[0], rivals=rivals, why_open=why_open)
 
 
 def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
@@ -259,14 +247,17 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     )
 
 
-def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
-    """Raise GeometryError if the map of a rival fits as well.
+def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> str:
+    """Raise GeometryError if the map of a rival of another scale fits as well.
 
-    Does nothing where even the best map explains too few ranges: then that is the reason to doubt it.
+    Where even the best map explains too few ranges, that is the reason to doubt it, and no rival is looked at.
+
+    Returns:
+        why the map of a rival of the same scale fits as well; empty if none does.
     """
     problem = solution.problem
     if np.mean(solution.fit.weights < OUTLIER_BELOW) > MANY_OUTLIERS:
-        return
+        return ""
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
         is_elsewhere = not is_on_side(problem, other.state, camera_side)
@@ -279,22 +270,22 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
             if min(ours, theirs) * extent < solution.noise_stddev_m:
                 raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
             if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
-                raise _another_place(solution)
+                return _another_place(problem)
             raise GeometryError(
                 f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
                 f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"
             )
+    return ""
 
 
-def _another_place(solution: Solution) -> GeometryError:
-    """Return the error for two maps of the same scale that fit in the site frame."""
-    stddevs = path_shape(solution.problem.centers).stddevs
+def _another_place(problem: RangeProblem) -> str:
+    """Return why two maps of the same scale fit in the site frame; raise GeometryError if their turn is open."""
+    stddevs = path_shape(problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        return GeometryError(
+        raise GeometryError(
             "the path is nearly straight, and the map fits the ranges as well if it is turned about it: walk a bend"
         )
-    return OpenPlaceError(
+    return (
         "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
-        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)",
-        solution.fit.state,
+        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)"
     )
