@@ -25,7 +25,7 @@ class ModelRanges:
         tags_in_cam_m: lever arm (3,) of each tag by id.
         anchors_m: position (3,) of each anchor by id, in the metric world.
         biases_m: range bias of each anchor by id, positive where its ranges are too long.
-        image_times_s: times of the photos by name; None where the log names photos.
+        image_times_s: times of the photos by name; empty where the log names photos.
         metric_path: a path in the metric world, to which other paths can be aligned.
         association: options for placing ranges on a path.
     """
@@ -34,13 +34,13 @@ class ModelRanges:
     tags_in_cam_m: Mapping[str, Array]
     anchors_m: Mapping[str, Array]
     biases_m: Mapping[str, float]
-    image_times_s: Mapping[str, float] | None
+    image_times_s: Mapping[str, float]
     metric_path: Trajectory
     association: RangesOptions
 
     def residuals_m(self, path: Trajectory) -> Array:
         """Return predicted minus measured ranges, (k,) metres, of the k ranges with a place on a metric path."""
-        timed = path if self.image_times_s is None else path.timed(self.image_times_s)
+        timed = path.timed(self.image_times_s) if self.image_times_s else path
         tags = np.array([self.tags_in_cam_m[id_] for id_ in self.log.tag_ids]).reshape(-1, 3)
         anchors = np.array([self.anchors_m[id_] for id_ in self.log.anchor_ids]).reshape(-1, 3)
         biases = np.array([self.biases_m[id_] for id_ in self.log.anchor_ids])
@@ -85,7 +85,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         tags_in_cam_m=dict(zip(tag_ids, result.lever_arms_m(tag_ids), strict=True)),
         anchors_m=anchors,
         biases_m={id_: result.summary.anchors[id_].range_bias_m or 0.0 for id_ in anchors},
-        image_times_s=result.timestamps_s,
+        image_times_s=result.timestamps_s or {},
         metric_path=metric_path,
         association=result.summary.settings.ranges.association,
     )

@@ -34,7 +34,7 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
     """
     survey = survey.changed({"images.model": model_path.absolute()})
     run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
-    times = None if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
+    times = {} if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
     run, metric = map_of_model(run, model, refine=False)
     log, inputs = metric.observations.log, run.inputs
     if log.timestamp_s is not None:

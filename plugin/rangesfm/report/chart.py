@@ -119,7 +119,7 @@ def panel_spec(panel: Panel, data_of: Callable[[int], Spec]) -> Spec:
     x_range, y_range = panel.limits
     x_label, y_label = panel.labels
     x_axis = {"title": x_label, "tickCount": 3 if panel.rows else 4 if width < 380 else 6}
-    y_axis = None if panel.rows else {"title": y_label, "tickCount": 5}
+    y_axis = {} if panel.rows else {"title": y_label, "tickCount": 5}
     return {
         "width": width,
         "height": height,
@@ -137,9 +137,9 @@ def panel_spec(panel: Panel, data_of: Callable[[int], Spec]) -> Spec:
     }
 
 
-def _axis(field: str, limits: Range, axis: Spec | None) -> Spec:
+def _axis(field: str, limits: Range, axis: Spec) -> Spec:
     scale = {"domain": list(limits), "nice": False, "zero": False}
-    return {"field": field, "type": "quantitative", "scale": scale, "axis": axis, "stack": None}
+    return {"field": field, "type": "quantitative", "scale": scale, "axis": axis or None, "stack": None}
 
 
 def _layer(kind: str, rows: list[Spec], encoding: Mapping[str, Any] = MappingProxyType({}), **mark: Any) -> Spec:
