@@ -39,14 +39,9 @@ _RICHER = {
 }
 # Parameters that the richer models have more of: f is fx and fy, and a single k is k1.
 _ORIGIN = {"fx": "f", "fy": "f", "k1": "k"}
-_MAX_NUM_ITERATIONS = 30
-# Relative decrease of the cost at which an adjustment ends.
-_FUNCTION_TOLERANCE = 1e-3
 # Trust region with which a free lens begins. Parameters of a rational distortion can hardly be told apart, so that
 # free steps fail; a chain of 600 photos still bends as it does in them.
 _TRUST_REGION_RADIUS = 1e6
-# Largest number of points between which lengths are compared.
-_MAX_NUM_POINTS = 300
 
 
 @dataclass(frozen=True)
@@ -163,12 +158,12 @@ def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
     """
     lens = dict.fromkeys(("refine_focal_length", "refine_extra_params", "refine_principal_point"), lens_is_free)
     # By this loss, wrong matches do not outweigh a lens.
-    of_solver = {"function_tolerance": _FUNCTION_TOLERANCE}
+    of_solver = {"function_tolerance": 1e-3}
     if lens_is_free:
         of_solver["initial_trust_region_radius"] = _TRUST_REGION_RADIUS
     ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": of_solver}
     options = RefineOptions(
-        max_num_iterations=_MAX_NUM_ITERATIONS,
+        max_num_iterations=30,
         bundle_adjustment={**lens, "refine_sensor_from_rig": False, "ceres": ceres_options},
     )
     frame_id = min(model.reg_frame_ids())
@@ -192,7 +187,7 @@ def _change_of_lengths(model: pycolmap.Reconstruction, other: pycolmap.Reconstru
     by_id = sorted(model.points3D.items())
     lengths_of_tracks = np.array([point.track.length() for _, point in by_id])
     often_seen = np.flatnonzero(lengths_of_tracks >= np.median(lengths_of_tracks))
-    some = often_seen[np.unique(np.linspace(0, len(often_seen) - 1, _MAX_NUM_POINTS).astype(np.int64))]
+    some = often_seen[np.unique(np.linspace(0, len(often_seen) - 1, 300).astype(np.int64))]
     places = np.array([by_id[k][1].xyz for k in some])
     others = to_model.apply(np.array([other.point3D(by_id[k][0]).xyz for k in some]))
     lengths, other_lengths = pdist(places), pdist(others)

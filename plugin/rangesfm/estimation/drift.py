@@ -42,8 +42,6 @@ SAME_NOISE = 0.05
 _TOLERANCE = 0.001
 # Movement of a keyframe, in standard deviations of a feature, above which photos show that loops were open.
 _NUM_VISIBLE_STDDEVS = 3.0
-# With many more steps, points follow a camera that is out of its place, which then stays there.
-_NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -269,7 +267,7 @@ def _carried(observations: Observations, before: Poses, after: Poses, local_scal
 def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
     """Return the (p, 3) points that fit the rays best, by Gauss-Newton steps that are kept where they help."""
     points, cost = start, costs_of_points(observations, poses, start)
-    for _ in range(_NUM_TRIANGULATIONS):
+    for _ in range(5):  # in many more steps, points follow a camera that is out of its place, which then stays there
         _, in_cam, derivative = project(observations, poses, points)
         residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
         root = robust_root_weights(residuals)[:, None]

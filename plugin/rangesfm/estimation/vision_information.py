@@ -33,7 +33,6 @@ _PIECE_STEP = _MAX_PIECE // 2
 # Up to _ENOUGH_PIECES in all none are dropped, and more than _MAX_NUM_PIECES are never used.
 _NUM_PIECES_OF_KEYFRAME = 40
 _ENOUGH_PIECES, _MAX_NUM_PIECES = 8000, 20000
-_BATCH = 500
 # Loss of an observation, whose residual is in standard deviations; at this width it has half its weight.
 _LOSS = RobustLoss(3.0, is_bounded=False)
 # Smallest plausible depth, as a share of the median depth: lenses are not sharp at less.
@@ -254,7 +253,7 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
     pieces, share = _thinned(_pieces(observations.point), len(poses))
     n = len(poses)
-    batches = [batch for rows in pieces for batch in np.array_split(rows, max(len(rows) // _BATCH, 1))]
+    batches = [batch for rows in pieces for batch in np.array_split(rows, max(len(rows) // 500, 1))]
     added = side_by_side(lambda rows: _added(*_eliminate(rows, observations.frame, in_rig, to_rig, poses)), batches)
     key = np.unique(np.concatenate([some for some, _ in added]))
     values = np.zeros((len(key), 6, 6))

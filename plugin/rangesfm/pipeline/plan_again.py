@@ -29,8 +29,6 @@ from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 _PHOTO_RATE_HZ = 2.0
 # Shares of the points between which the room is: some points are seen through windows, or wrong.
 _MOST_OF_POINTS = (0.01, 0.99)
-# Largest number of points of the map that are tried as places for anchors.
-_NUM_SURFACES = 500
 # A map without a place in a site has no coordinates that anybody knows: these are about its first photo.
 _AXES, _LEVEL = " (metres right of, ahead of and above the first photo)", " above the first photo"
 # An anchor on a wall is in front of it: distance of the wall behind it, metres.
@@ -157,7 +155,7 @@ def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:
     (left, front, lowest), (right, back, highest) = places.min(axis=0) - _BEHIND_M, places.max(axis=0) + _BEHIND_M
     corners = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
     surfaces_m = points_m[np.all((points_m >= low) & (points_m <= high), axis=1)] if len(points_m) else points_m
-    some = np.linspace(0, len(surfaces_m) - 1, min(len(surfaces_m), _NUM_SURFACES)).astype(np.int64)
+    some = np.linspace(0, len(surfaces_m) - 1, min(len(surfaces_m), 500)).astype(np.int64)
     return replace(
         planned,
         walls_m=(corners,),

@@ -12,8 +12,6 @@ from rangesfm.solver.linear_map import EstimatedMistake
 
 RISK = 1e-4
 """Probability with which the scale may be off by more than the bound."""
-# Number of sizes of a mistake that are tried.
-_NUM_SIZES = 80
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class HiddenMistake:
         farthest = np.sqrt(self.threshold) - special.ndtri(RISK)
         if self.slope > 0:
             farthest = min(farthest, self.most / self.slope)
-        moves = np.linspace(0.0, farthest, _NUM_SIZES)
+        moves = np.linspace(0.0, farthest, 80)
         return self.slope * moves, np.asarray(special.chndtr(self.threshold, max(self.num, 1), moves**2))
 
 

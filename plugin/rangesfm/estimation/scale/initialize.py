@@ -36,9 +36,6 @@ from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import with_one_blas_thread
 
-# Number of observations with which it is tested which of them contradict the others.
-_NUM_OF_TESTS = 120
-
 
 @with_one_blas_thread
 def initialize_scale(
@@ -145,7 +142,7 @@ def _started(
         placed = place_first([each for each in kinds if each.is_used]).start
         if len(others) == len(kinds):
             break
-        kinds, before = tested_kinds(kinds, placed, _NUM_OF_TESTS, is_last=is_last), others
+        kinds, before = tested_kinds(kinds, placed, 120, is_last=is_last), others
         others = tuple(each for each in kinds if not each.is_solved)
         if [each.left_out for each in others] == [each.left_out for each in before]:
             break

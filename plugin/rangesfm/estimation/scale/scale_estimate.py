@@ -248,11 +248,6 @@ class ScaleEstimate:
         return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"
 
 
-NUM_CURVE_POINTS = 601
-CURVE_FACTOR = 3.0
-"""The curve runs from the scale divided by this factor to the scale times it."""
-
-
 @dataclass(frozen=True)
 class ScaleDiagnostics:
     """Tables beside a ScaleEstimate; all scales are in metres per SfM unit.
@@ -260,7 +255,7 @@ class ScaleDiagnostics:
     Attributes:
         candidate_rows: (k,) rows of the log whose ranges have candidates.
         candidates: (k, 2) the smaller and the larger candidate of each.
-        curve_scales: (m,) increasing scales.
+        curve_scales: (m,) increasing scales, from a third of the estimate to three times it.
         num_agreeing: (m,) number of ranges that agree with each scale.
     """
 
@@ -289,7 +284,7 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
     tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
-    scales = placed.scale * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
+    scales = placed.scale * np.geomspace(1 / 3, 3, 601)
     num_begun = np.searchsorted(np.sort(starts), scales, side="right")
     return ScaleDiagnostics(
         candidate_rows=np.zeros(0, dtype=np.int64) if table is None else rows[table.rows],
