@@ -371,10 +371,10 @@ def _triangles(log: RangeLog, ids: Sequence[str]) -> _Triangles:
     index_of = {anchor_id: k for k, anchor_id in enumerate(ids)}
     own = np.array([index_of.get(anchor_id, -1) for anchor_id in log.anchor_ids])
     parts = [*_at_one_moment(log, own)]
-    between = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
-    ends = own[between.ends].reshape(-1, 2)
+    between = np.flatnonzero(log.kind == RangeKind.ANCHOR_ANCHOR)
+    ends = np.column_stack([log.peer_index, log.anchor_index])[between]
     # A range between anchors says more than a triangle, so it is repeated as often as is needed to be believed.
-    known, ranges_m = np.repeat(ends, _MIN_TRIANGLES, axis=0), np.repeat(log.range_m[between.rows], _MIN_TRIANGLES)
+    known, ranges_m = np.repeat(own[ends], _MIN_TRIANGLES, axis=0), np.repeat(log.range_m[between], _MIN_TRIANGLES)
     parts.append(_Triangles(known, ranges_m - _MAX_ERROR_M, ranges_m + _MAX_ERROR_M))
     pair = np.concatenate([part.pair for part in parts])
     shortest_m, longest_m = (np.concatenate([getattr(p, name) for p in parts]) for name in ("shortest_m", "longest_m"))

@@ -52,10 +52,12 @@ class TestWithAnchors:
 class TestPeerRanges:
     def test_ranges_between_anchors_are_had_with_both_ends(self) -> None:
         log = log_of(("t", "A"), ("B", "A"), ("t", "B"), ("C", "B")).with_anchors({"A", "B", "C"})
-        ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
-        assert ranges.rows.tolist() == [1, 3]
-        assert [set(ids) for ids in ranges.end_ids] == [{"A", "B"}, {"B", "C"}]
-        assert [tuple(log.anchor_ids[k] for k in ends) for ends in ranges.ends] == list(ranges.end_ids)
+        rows = np.flatnonzero(log.kind == RangeKind.ANCHOR_ANCHOR)
+        assert rows.tolist() == [1, 3]
+        ends = [*zip(*log.end_ids(), strict=True)]
+        assert [set(ends[row]) for row in rows] == [{"A", "B"}, {"B", "C"}]
+        by_index = zip(log.peer_index[rows], log.anchor_index[rows], strict=True)
+        assert [(log.anchor_ids[one], log.anchor_ids[other]) for one, other in by_index] == [ends[row] for row in rows]
 
     def test_subset_forgets_nodes_without_ranges_and_keeps_kinds(self) -> None:
         log = log_of(("t", "A"), ("B", "C"), ("t", "u"), ("v", "A")).with_anchors({"A", "B", "C"})

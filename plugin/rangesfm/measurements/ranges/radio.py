@@ -95,15 +95,16 @@ def lengths_by_radio(
         bias_m, bias_stddev_m: (num_anchors,) known bias of each anchor's ranges, and its standard deviation.
         common_bias_stddev_m: standard deviation of the bias that all ranges between anchors share.
     """
-    ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
-    range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
-    pairs, index = np.unique(np.sort(ranges.ends, axis=1), axis=0, return_inverse=True)
+    rows = np.flatnonzero(log.kind == RangeKind.ANCHOR_ANCHOR)
+    ends = np.column_stack([log.peer_index, log.anchor_index])[rows]
+    range_m, given = log.range_m[rows], log.range_stddev_m[rows]
+    pairs, index = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
     index = index.reshape(-1)
     count = np.bincount(index, minlength=len(pairs))
     noise = np.where(np.isfinite(given), given, noise_m)
     medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
     mean_square = np.bincount(index, noise**2, len(pairs)) / count
-    shared = np.bincount(index, shared_stddev(log)[ranges.rows], len(pairs)) / count
+    shared = np.bincount(index, shared_stddev(log)[rows], len(pairs)) / count
     first, second = pairs.reshape(-1, 2).T
     variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
     variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,20 +30,6 @@ class RangeKind(IntEnum):
     TAG_ANCHOR = 0
     ANCHOR_ANCHOR = 1
     TAG_TAG = 2
-
-
-class PeerRanges(NamedTuple):
-    """k ranges between two anchors, or between two tags.
-
-    Attributes:
-        rows: (k,) rows of the log.
-        ends: (k, 2) indices of the two nodes in the log's ``anchor_ids`` or ``tag_ids``.
-        end_ids: ids of the two nodes of each range.
-    """
-
-    rows: Indices
-    ends: Indices
-    end_ids: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -171,14 +157,6 @@ class RangeLog:
         order = order[np.argsort(link[order], kind="stable")]
         same = np.diff(link[order]) == 0
         return np.diff(times[order])[same], link[order][1:][same]
-
-    def peer_ranges(self, kind: RangeKind) -> PeerRanges:
-        """Return the ranges between two anchors, which do not depend on the camera, or those between two tags."""
-        rows = np.flatnonzero(self.kind == kind)
-        ids, first, second = self._ends()
-        ends = np.column_stack([first[rows], second[rows]])
-        first_node = 0 if kind == RangeKind.ANCHOR_ANCHOR else len(self.anchor_ids)
-        return PeerRanges(rows, ends - first_node, tuple((ids[one], ids[other]) for one, other in ends.tolist()))
 
     def end_ids(self) -> tuple[list[str], list[str]]:
         """Return the ids of the two ends of each range: n tags (or peers if none) and n anchors (or peers)."""

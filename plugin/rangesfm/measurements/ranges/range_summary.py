@@ -103,12 +103,11 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
 
 def _summarize_pairs(log: RangeLog, name: str, kind: RangeKind) -> Iterator[LinkSummary]:
     """Yield the summary of each pair of nodes, with the ranges of both directions."""
-    ranges = log.peer_ranges(kind)
-    rows: dict[frozenset[str], list[int]] = {}
-    for row, ids in enumerate(ranges.end_ids):
-        rows.setdefault(frozenset(ids), []).append(row)
+    ends, rows = list(zip(*log.end_ids(), strict=True)), dict[frozenset[str], list[int]]()
+    for row in np.flatnonzero(log.kind == kind).tolist():
+        rows.setdefault(frozenset(ends[row]), []).append(row)
     for mine in rows.values():
-        yield LinkSummary(name, ranges.end_ids[mine[0]], *_lengths(log.range_m[ranges.rows[mine]]))
+        yield LinkSummary(name, ends[mine[0]], *_lengths(log.range_m[mine]))
 
 
 def _summarize_anchor(log: RangeLog, index: int, quantization_m: float) -> LinkSummary:

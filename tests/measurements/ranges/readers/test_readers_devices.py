@@ -253,11 +253,11 @@ def test_trek1000_lines_are_read_with_the_radios_clock(tmp_path: Path) -> None:
     later = TREK_MC.replace("642b", "648f").replace("0000087e", "ffffffff")
     log = read_ranges(write(tmp_path, "\n".join([TREK_MR, TREK_MA, TREK_MC, "mc 07 0000", later]) + "\n"))
     assert (log.format, log.tag_ids, log.anchor_ids) == ("trek1000", ("T0",), ("A0", "A1", "A2"))
-    between = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
-    assert [*zip(between.end_ids, log.range_m[between.rows])] == [
-        (("A0", "A1"), 1.753),
-        (("A0", "A2"), 1.692),
-        (("A1", "A2"), 0.619),
+    between = log.subset(log.kind == RangeKind.ANCHOR_ANCHOR)
+    assert [*zip(*between.end_ids(), between.range_m)] == [
+        ("A0", "A1", 1.753),
+        ("A0", "A2", 1.692),
+        ("A1", "A2", 0.619),
     ]
     of_tag = log.subset(log.kind == RangeKind.TAG_ANCHOR)
     assert of_tag.range_m.tolist() == [1.26, 2.286, 2.174, 1.26, 2.286]
