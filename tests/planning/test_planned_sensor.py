@@ -34,15 +34,14 @@ def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion
     path, log = photos(motion, noise_rad=5e-4, bend=0.002, seed=seed), imu_log(motion, grade=PHONE, seed=seed)
     sensor = InertialSensor(log).aligned_with(path)
     assert sensor.alignment is not None
-    problem = InertialProblem.of_sensor(sensor, sensor.alignment, path)
-    stated = scale_by_sensor(problem, WalkBending(in_first_camera(path))).alone
+    problem = InertialProblem.of_sensor(sensor, sensor.alignment, path, WalkBending(in_first_camera(path)))
+    run = scale_by_sensor(problem)
     assert path.timestamps_s is not None
     turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
     true = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
     on_map = PlannedSensor().on_map(true, WalkBending(in_first_camera(true)))
-    sizes = {name: stated.problem.sizes[name] for name in on_map.sizes}
-    alike = replace(replace(on_map, sizes=sizes).alone.problem, sizes=stated.problem.sizes)
-    assert alike.posterior().uncertainty.empirical == pytest.approx(stated.posterior.uncertainty.empirical, rel=0.15)
+    alike = replace(replace(on_map, sizes=run.sizes).alone.problem, sizes=run.alone.problem.sizes)
+    assert alike.posterior().uncertainty.empirical == pytest.approx(run.alone.posterior.uncertainty.empirical, rel=0.15)
 
 
 def test_a_level_camera_leaves_scale_factors_open_and_tilting_it_gains_what_the_plan_promises(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.demo.simulated_imu import Grade, simulate_imu
+from rangesfm.demo.simulated_imu import GRAVITY_M_S2, Grade, simulate_imu
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -36,6 +36,38 @@ class Motion:
     def places_m(self, times_s: Array) -> Array:
         waves = np.sin(2 * np.pi * self.frequencies_hz * times_s[:, None, None] + self.phases[::-1])
         return np.asarray(np.sum(self.amplitudes_m * waves, axis=2))
+
+
+@dataclass(frozen=True)
+class Walk(Motion):
+    """A motion by hand that is carried round a room: a circle at steady speed, on which the camera looks forward.
+
+    Attributes:
+        radius_m: of the circle. speed_m_s: on it.
+    """
+
+    radius_m: float
+    speed_m_s: float
+
+    def _angles(self, times_s: Array) -> Array:
+        return times_s * self.speed_m_s / self.radius_m
+
+    def world_from_imu(self, times_s: Array) -> Rotation:
+        return Rotation.from_euler("z", self._angles(times_s)[:, None]) * super().world_from_imu(times_s)
+
+    def places_m(self, times_s: Array) -> Array:
+        angles = self._angles(times_s)
+        circle = self.radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+        return np.asarray(circle + super().places_m(times_s))
+
+
+def by_walk(seed: int = 0) -> Walk:
+    """Return an even walk round a room, with a hand that hardly sways."""
+    rng = np.random.default_rng(seed)
+    frequencies_hz = rng.uniform(0.05, 0.6, 8)
+    turns, places = rng.normal(size=(2, 3, 8)) * np.array([[[0.03]], [[0.002]]])
+    waves = turns / frequencies_hz**0.5, places / frequencies_hz, frequencies_hz, rng.uniform(0, 6.28, (3, 8))
+    return Walk(*waves, radius_m=rng.uniform(1.4, 2.2), speed_m_s=0.5)
 
 
 def by_hand(seed: int = 0, *, axes: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Motion:
@@ -80,6 +112,7 @@ def imu_log(
     until_s: float = 70.0,
     seed: int = 1,
     grade: Grade = CONSTANT,
+    gravity_m_s2: float = GRAVITY_M_S2,
 ) -> ImuLog:
     """Return the log of a sensor.
 
@@ -87,7 +120,8 @@ def imu_log(
         offset_s: image time minus time of the log.
     """
     times_s = np.arange(0.0, until_s, 1 / rate_hz)
-    log = simulate_imu(motion.world_from_imu, motion.places_m, times_s, rate_hz, grade, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    log = simulate_imu(motion.world_from_imu, motion.places_m, times_s, rate_hz, grade, rng, gravity_m_s2)
     gyro_zero, accel_zero = ZEROS if grade is CONSTANT else np.zeros((2, 3))
     gyro_rad_s, accel_m_s2 = log.gyro_rad_s + gyro_zero, log.accel_m_s2 + accel_zero
     return ImuLog(times_s - offset_s, gyro_rad_s, accel_m_s2, "imu.csv")
@@ -99,6 +133,7 @@ def photos(
     until_s: float = 60.0,
     every_s: float = 0.7,
     noise_rad: float = 1e-3,
+    noise_m: float = 0.0,
     bend: float = 0.0,
     seed: int = 3,
 ) -> Trajectory:
@@ -117,5 +152,5 @@ def photos(
     knots_s = np.linspace(times_s[0], times_s[-1], 7)
     bent = bend * np.linalg.norm(places_m.std(axis=0)) * rng.normal(size=(7, 3))
     places_m = places_m + np.column_stack([np.interp(times_s, knots_s, axis) for axis in bent.T])
-    centers = world.apply(places_m) * 0.37
+    centers = world.apply(places_m + noise_m * rng.normal(size=places_m.shape)) * 0.37
     return Trajectory(np.arange(len(times_s)), names, times_s, centers, turns.as_matrix())

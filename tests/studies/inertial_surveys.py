@@ -2,10 +2,11 @@
 
 Run: python -m tests.studies.inertial_surveys [--num_seeds 10] [--num_mistakes 20] [--seed 0]
 
-Surveys: by hand, by drone, and by a rover that hardly accelerates; sensors of a phone's and of tactical grade, each
-with an accelerometer whose axes are off by 3 % (1 stddev). Time offset and rotation are found; the rover's, which turns
-about one axis, is given. The photos' path bends by 0.2 % of its size. A mistake is drawn at random and put into a
-survey by hand with a phone; it is named if the message, a warning or a doubt has its word.
+Surveys: by hand, by drone, by an even walk round a room whose photos err by 5 mm each, and by a rover that hardly
+accelerates; sensors of a phone's and of tactical grade, each with an accelerometer whose axes are off by 3 % (1
+stddev). Time offset and rotation are found; the rover's, which turns about one axis, is given. Gravity is that of
+another place on the earth in each. The photos' path bends by 0.2 % of its size. A mistake is drawn at random and put
+into a survey by hand with a phone; it is named if the message, a warning or a doubt has its word.
 
 Prints for each kind of survey in how many the true scale is in its 95 % interval, the median half width, that of a plan
 (`rangesfm plan`, whose maps bend as usual, and not as little as these), the root mean square of the errors of scale and
@@ -31,9 +32,11 @@ from tests.simulated.inertial import (
     CAM_FROM_IMU,
     TACTICAL,
     Motion,
+    Walk,
     by_drone,
     by_hand,
     by_rover,
+    by_walk,
     imu_log,
     photos,
 )
@@ -41,11 +44,13 @@ from tests.simulated.inertial import (
 from rangesfm.arrays import Array
 from rangesfm.demo.simulated_imu import GRAVITY_M_S2, PHONE, Grade
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.measurements.imu import sensor_prior
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS, read_imu
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.sensor import InertialSensor
+from rangesfm.measurements.imu.sensor_prior import GRAVITY_STDDEV
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points
@@ -54,6 +59,7 @@ from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 MOTIONS: dict[str, Callable[[int], Motion]] = {
     "hand": by_hand,
     "drone": by_drone,
+    "walk": by_walk,
     "rover": by_rover,
 }
 GRADES = {"phone": PHONE, "tactical": TACTICAL}
@@ -72,17 +78,17 @@ class Found(NamedTuple):
 
 
 def made(motion: Motion, grade: Grade, seed: int) -> tuple[ImuLog, Trajectory]:
-    path = photos(motion, noise_rad=5e-4, bend=BEND, seed=seed)
-    return imu_log(motion, offset_s=OFFSET_S, grade=grade, seed=seed), path
+    path = photos(motion, noise_rad=5e-4, noise_m=0.005 * isinstance(motion, Walk), bend=BEND, seed=seed)
+    gravity_m_s2 = sensor_prior.GRAVITY_M_S2 * (1 + GRAVITY_STDDEV * np.random.default_rng((seed, 9)).normal())
+    return imu_log(motion, offset_s=OFFSET_S, grade=grade, gravity_m_s2=gravity_m_s2, seed=seed), path
 
 
 def located(sensor: InertialSensor, path: Trajectory) -> tuple[InertialScale, str]:
     """Return the sensor on the map, as a run finds it, and the warnings."""
     aligned = sensor.aligned_with(path)
     assert aligned.alignment is not None
-    found = scale_by_sensor(
-        InertialProblem.of_sensor(aligned, aligned.alignment, path), WalkBending(in_first_camera(path))
-    )
+    bending = WalkBending(in_first_camera(path))
+    found = scale_by_sensor(InertialProblem.of_sensor(aligned, aligned.alignment, path, bending))
     return found, "; ".join(aligned.alignment.mistakes)
 
 

@@ -48,6 +48,7 @@ def simulate_imu(
     rate_hz: float,
     grade: Grade,
     rng: np.random.Generator,
+    gravity_m_s2: float = GRAVITY_M_S2,
 ) -> ImuLog:
     """Return what a sensor measures on its way through a world whose z is up.
 
@@ -60,7 +61,7 @@ def simulate_imu(
     now = world_from_imu(times_s)
     gyro = (world_from_imu(times_s - h).inv() * world_from_imu(times_s + h)).as_rotvec() / (2 * h)
     later, here, before = (places_m(times_s + k * h) for k in (1, 0, -1))
-    force = now.inv().apply((later - 2 * here + before) / h**2 + np.array([0.0, 0.0, GRAVITY_M_S2]))
+    force = now.inv().apply((later - 2 * here + before) / h**2 + np.array([0.0, 0.0, gravity_m_s2]))
     walked = rng.normal(size=(2, *gyro.shape)).cumsum(axis=1) / np.sqrt(rate_hz)
     zeros, scales = rng.normal(size=(2, 2, 3))
     noise = rng.normal(size=(2, *gyro.shape)) * np.sqrt(rate_hz)

@@ -18,7 +18,6 @@ from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialStat
 from rangesfm.measurements.imu.inertial_scale import InertialScale
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import Mounting
-from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR
 from rangesfm.measurements.imu.sensor_prior import (
     ARM_STDDEV_M,
     GIVEN_TURN_STDDEV_RAD,
@@ -93,9 +92,9 @@ class PlannedSensor(Options, table="imu"):
         gravity = -GRAVITY_M_S2 * UP_IN_SITE
         log = ImuLog(at_s, turns(at_s, 1), turns(at_s).inv().apply(places(at_s, 2) - gravity))
         prior = SensorPrior(log.step_s / np.sqrt(12), GIVEN_TURN_STDDEV_RAD, ARM_STDDEV_M)
-        problem = InertialProblem(log, path, mounting, prior)
-        state = InertialState(1.0, places(times_s, 1), gravity, np.zeros(NUM_OF_SENSOR), mounting, np.ones(len(path)))
-        return PlannedScale(problem, bending, 1.0, state, self.sizes, problem.summed_up(state, self.sizes))
+        problem = InertialProblem(log, path, mounting, prior, bending)
+        state = replace(InertialState.at_rest(gravity, mounting, len(path)), velocities_m_s=places(times_s, 1))
+        return PlannedScale(problem, state, self.sizes, problem.summed_up(state, self.sizes))
 
 
 @dataclass(frozen=True)
@@ -105,6 +104,6 @@ class PlannedScale(InertialScale):
     @cached_property
     def alone(self) -> JointMap:
         """The map by the sensor alone."""
-        found = join_kinds((self,), self.problem.path, self.start, self.bending)
+        found = join_kinds((self,), self.problem.path, self.start, self.problem.bending)
         problem = replace(found.problem, sizes={**usual_sizes(found.problem.components), **self.sizes})
         return replace(found, problem=problem, posterior=problem.posterior())

@@ -117,8 +117,8 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
 def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
     if inputs.imu is None or inputs.imu.alignment is None:
         return None
-    problem = InertialProblem.of_sensor(inputs.imu, inputs.imu.alignment, at.path)
-    return scale_by_sensor(problem, at.bending, at.metres_per_unit)
+    alignment, size = inputs.imu.alignment, at.metres_per_unit
+    return scale_by_sensor(InertialProblem.of_sensor(inputs.imu, alignment, at.path, at.bending, size))
 
 
 KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], Located | None]] = {

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, imu_log, photos
+from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, by_walk, imu_log, photos
 
+from rangesfm.demo.simulated_imu import PHONE
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
@@ -27,13 +28,13 @@ def posed(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialProbl
     """Return a log with scale errors on the path of photos."""
     log, path = imu_log(motion, seed=seed), photos(motion, noise_rad=3e-4)
     log = ImuLog(log.timestamp_s, log.gyro_rad_s, (1 + accel_scale) * log.accel_m_s2)
-    return InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR)
+    return InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, WalkBending(path))
 
 
 def located(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialScale:
     """Return its scale."""
     problem = posed(motion, accel_scale, seed=seed)
-    return scale_by_sensor(problem, WalkBending(problem.path))
+    return scale_by_sensor(problem)
 
 
 def test_a_log_gives_metres_whatever_the_scale_errors_of_its_axes() -> None:
@@ -46,6 +47,20 @@ def test_a_log_gives_metres_whatever_the_scale_errors_of_its_axes() -> None:
         errors.append(off / found.posterior.uncertainty.empirical)
     assert np.abs(errors).max() < 3
     assert np.sqrt(np.mean(np.square(errors))) < 2
+
+
+def test_errors_of_photos_on_an_even_walk_do_not_make_the_map_smaller() -> None:
+    errors = []
+    for seed in range(4):
+        motion = by_walk(seed)
+        path = photos(motion, every_s=0.5, noise_rad=5e-4, noise_m=0.005, seed=seed)
+        mounting, log = Mounting(CAM_FROM_IMU, np.zeros(3)), imu_log(motion, grade=PHONE, seed=seed)
+        found = scale_by_sensor(InertialProblem(log, path, mounting, PRIOR, WalkBending(path))).alone
+        errors.append([np.log(found.scale.value / METRES_PER_UNIT), found.posterior.uncertainty.empirical])
+    off, stddev = np.transpose(errors)
+    assert abs(off.mean()) < 0.05
+    assert np.abs(off / stddev).max() < 3
+    assert np.sqrt(np.mean(np.square(off / stddev))) < 1.7
 
 
 def test_the_interval_of_a_rover_that_hardly_turns_or_accelerates_is_wide() -> None:
@@ -72,9 +87,7 @@ def test_axes_that_are_not_at_right_angles_neither_tilt_the_map_nor_hide_its_sca
     problem = posed(by_hand(1, axes=(3.0, 3.0, 3.0)), np.zeros(3))
     across = np.array([[0.0, 0.02, -0.01], [-0.01, 0.0, 0.02], [0.02, 0.01, 0.0]])
     log = replace(problem.log, accel_m_s2=problem.log.accel_m_s2 @ (np.eye(3) + across).T)
-    right, wrong = (
-        scale_by_sensor(replace(problem, log=each), WalkBending(problem.path)) for each in (problem.log, log)
-    )
+    right, wrong = (scale_by_sensor(replace(problem, log=each)) for each in (problem.log, log))
     assert wrong.alone.posterior.uncertainty.half_width_95 < 1.2 * right.alone.posterior.uncertainty.half_width_95
     assert wrong.alone.scale.value == pytest.approx(right.alone.scale.value, rel=0.002)
     apart = np.linalg.norm(wrong.upward.up_in_first_camera - right.upward.up_in_first_camera)
@@ -85,4 +98,4 @@ def test_a_log_of_another_day_is_refused() -> None:
     problem = posed(by_hand(), np.zeros(3))
     later = replace(problem.log, timestamp_s=problem.log.timestamp_s + 86400.0)
     with pytest.raises(GeometryError, match="no time in common"):
-        scale_by_sensor(replace(problem, log=later), WalkBending(problem.path))
+        scale_by_sensor(replace(problem, log=later))

@@ -9,10 +9,10 @@ assumed there, and are linear combinations of all measurements where they are no
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
@@ -35,6 +35,7 @@ from rangesfm.measurements.imu.sensor_prior import (
     GRAVITY_STDDEV,
     SensorPrior,
 )
+from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import regular
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.util.geometry.poses import Poses
@@ -60,6 +61,8 @@ class InertialState:
         scale: metres per unit of the path. velocities_m_s: (n, 3). gravity_m_s2: (3,) in the path's world.
         sensor: (19,). mounting: of the sensor.
         weights: (n,) of the intervals after each photo, robust.
+        place_errors_m: (n, 2, 3) most likely errors of the photos' places before and after these intervals.
+        reliability: share of the motion at the most likely places that is no error (Fuller, 1987, section 1.1).
     """
 
     scale: float
@@ -68,6 +71,14 @@ class InertialState:
     sensor: Array
     mounting: Mounting
     weights: Array
+    place_errors_m: Array
+    reliability: float
+
+    @classmethod
+    def at_rest(cls, gravity_m_s2: Array, mounting: Mounting, num: int) -> InertialState:
+        """Return the state of a perfect sensor at the places of ``num`` photos, metric and without errors."""
+        nothing = np.zeros((num, 3)), np.zeros((num, 2, 3))
+        return cls(1.0, nothing[0], gravity_m_s2, np.zeros(NUM_OF_SENSOR), mounting, np.ones(num), nothing[1], 1.0)
 
     @property
     def horizontal(self) -> Array:
@@ -84,6 +95,8 @@ class InertialProblem:
         log: on the clock of the photos.
         path: of the n photos, with times. mounting: of the sensor in the rig, as known before.
         prior: what is known of the sensor's numbers, and of errors of clock and mounting.
+        bending: of the path. metres_per_unit: units of the path in one unit of that which ``bending`` has.
+        bending_factor: how much larger that is than expected from the photos' residuals (section 3).
         time_offset_s: what was added to the times of the log as it was read.
     """
 
@@ -91,11 +104,22 @@ class InertialProblem:
     path: Trajectory
     mounting: Mounting
     prior: SensorPrior
+    bending: MapBending
+    metres_per_unit: float = 1.0
+    bending_factor: float = 1.0
     time_offset_s: float = 0.0
+    _bent: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of_sensor(cls, sensor: InertialSensor, found: ImuAlignment, path: Trajectory) -> InertialProblem:
-        """Return the log of a sensor that is aligned with the photos of a path."""
+    def of_sensor(
+        cls,
+        sensor: InertialSensor,
+        found: ImuAlignment,
+        path: Trajectory,
+        bending: MapBending,
+        metres_per_unit: float = 1.0,
+    ) -> InertialProblem:
+        """Return the log of a sensor that is aligned with the photos of a path; the others are attributes."""
         log = replace(found.log, timestamp_s=found.log.timestamp_s + found.time_offset_s)
         turn_rad = float(np.sqrt(np.linalg.eigvalsh(found.rotation_covariance)[-1]))
         prior = SensorPrior(
@@ -106,7 +130,8 @@ class InertialProblem:
         arm = np.zeros(3) if sensor.imu_in_cam_m is None else sensor.imu_in_cam_m
         noise = sensor.log.noise
         prior = prior if noise is None else prior.with_given(noise)
-        return cls(log, path, Mounting(found.cam_from_imu, arm), prior, found.time_offset_s)
+        mounting = Mounting(found.cam_from_imu, arm)
+        return cls(log, path, mounting, prior, bending, metres_per_unit, time_offset_s=found.time_offset_s)
 
     @property
     def times_s(self) -> Array:
@@ -121,8 +146,7 @@ class InertialProblem:
         world_from_imu = self.path.world_from_cam @ self.mounting.rig_from_imu
         force = np.einsum("nij,nj->ni", world_from_imu, self.log.accel_m_s2[at]).mean(axis=0)
         gravity = -GRAVITY_M_S2 * force / np.linalg.norm(force)
-        velocities = np.zeros((len(self.path), 3))
-        return InertialState(1.0, velocities, gravity, np.zeros(NUM_OF_SENSOR), self.mounting, np.ones(len(self.path)))
+        return InertialState.at_rest(gravity, self.mounting, len(self.path))
 
     def likeliest(self, state: InertialState, sizes: Sizes) -> InertialState:
         """Return the most likely state for errors of these sizes, from another one.
@@ -136,6 +160,10 @@ class InertialProblem:
             if step and abs(np.log(state.scale / before.scale)) <= NEGLIGIBLE_STDDEVS * stddev:
                 break
         return state
+
+    def at_scale(self, scale: float, state: InertialState, intervals: Preintegrated, sizes: Sizes) -> InertialState:
+        """Return the most likely state in which the path has a given scale, from one of another scale."""
+        return self._improved(self.linearized(state, intervals), sizes, scale)[0]
 
     def summed_up(self, state: InertialState, sizes: Sizes) -> Preintegrated:
         """Return the log summed up between the photos, about the sensor's numbers of a state.
@@ -158,22 +186,46 @@ class InertialProblem:
         poses, sensor = Poses(self.path.world_from_cam, metric), np.tile(state.sensor, (len(intervals), 1))
         errors = MotionErrors.at(intervals, poses, state.velocities_m_s, state.gravity_m_s2, sensor, state.mounting)
 
-        def by_motion_of_photos(motion: Array, part: slice) -> Array:
-            ends = np.stack([motion[intervals.before], motion[intervals.after]], axis=1)
+        def by_motion_of_photos(ends: Array, part: slice) -> Array:
             return np.asarray(np.einsum("kiaj,kaj->kia", errors.by_pose[:, :, :, part], ends))
 
-        by_scale = by_motion_of_photos(metric, slice(3, 6)).sum(axis=2, keepdims=True)
+        ends = np.column_stack([intervals.before, intervals.after])
+        # Errors of places would pass for motion that the sensor did not feel, and make the map too small. So the
+        # derivative by the scale is that at the most likely places, as in the Gauss-Helmert model (Pope, "Some pitfalls
+        # to be avoided in the iterative adjustment of nonlinear problems", 1972). What is left of the errors there is
+        # of no effect on the scale, but would pass for information.
+        grown = by_motion_of_photos(metric[ends], slice(3, 6)).sum(axis=2)
+        of_errors = by_motion_of_photos(state.place_errors_m[intervals.before], slice(3, 6)).sum(axis=2)
+        by_scale = state.reliability * (grown - of_errors)[:, :, None]
         of_all = [by_scale, errors.by_gravity, errors.by_sensor, errors.by_turn, errors.by_arm]
-        late = by_motion_of_photos(self._motion(state), slice(0, 6))[:, :, :, None]
-        return LinearMotion(state, intervals, errors, np.concatenate(of_all, axis=2), late)
+        rates = self._rates(state)
+        late = by_motion_of_photos(rates[ends], slice(0, 6))[:, :, :, None]
+        return LinearMotion(self, state, intervals, errors, np.concatenate(of_all, axis=2), grown, late, rates)
 
-    def _motion(self, state: InertialState) -> Array:
+    def _rates(self, state: InertialState) -> Array:
         """Return the (n, 6) rates of the photos' poses: rad/s in the rig's own frame, and m/s of its origin."""
         log = self.log
         rates = np.column_stack([np.interp(self.times_s, log.timestamp_s, axis) for axis in log.gyro_rad_s.T])
         in_rig = ((1 - state.sensor[GYRO_SCALE]) * rates - state.sensor[GYRO_BIAS]) @ state.mounting.rig_from_imu.T
         arms = np.cross(in_rig, state.mounting.imu_in_rig_m)
         return np.column_stack([in_rig, state.velocities_m_s - np.einsum("nij,nj->ni", self.path.world_from_cam, arms)])
+
+    def bent_poses(self, photos: Indices, scale: float) -> Array:
+        """Return the (6 q, 6 q) covariance of turns (rad) and places (m) of q photos as the photos let the map bend.
+
+        Args:
+            scale: metres per unit of the path.
+        """
+        key, num = photos.tobytes(), len(photos)
+        if key not in self._bent:
+            by_pose = np.zeros((6 * num, 6 * len(self.path)))
+            by_pose[np.arange(6 * num), (6 * photos[:, None] + np.arange(6)).ravel()] = 1.0
+            self._bent[key] = self.bending.of_functions(by_pose, frame_is_free=False).formal_m2
+        found = self.bending_factor**2 * self._bent[key]
+        to_metric = block_diag(np.eye(3), scale * self.metres_per_unit * self.path.world_from_cam[0])
+        return np.asarray(np.einsum("ij,pjqk,lk->piql", to_metric, found.reshape(num, 6, num, 6), to_metric)).reshape(
+            6 * num, 6 * num
+        )
 
     def off_prior(self, state: InertialState) -> Array:
         """Return the (29,) differences of the shared numbers from what was known of them; 0 where nothing was."""
@@ -183,22 +235,37 @@ class InertialProblem:
         off[ARM] = state.mounting.imu_in_rig_m - self.mounting.imu_in_rig_m
         return off
 
-    def _improved(self, motion: LinearMotion, sizes: Sizes) -> tuple[InertialState, float]:
-        """Return a better state, and the standard deviation of the scale's logarithm."""
+    def _improved(self, motion: LinearMotion, sizes: Sizes, scale: float | None = None) -> tuple[InertialState, float]:
+        """Return a better state, and the standard deviation of the scale's logarithm.
+
+        Args:
+            scale: that of the better state, whose robust weights stay; None: it is estimated with all else.
+        """
         state, stretches = motion.state, motion.stretches(sizes)
         priors, off = self._priors(state)
         design = np.vstack([*(each.combination @ each.shared for each in stretches), priors])
         residual = np.concatenate([*(each.combination @ each.residual for each in stretches), off])
         if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < NUM_SHARED:
             raise GeometryError("the inertial sensor does not tell the scale: too few of its intervals are known")
-        step = -np.linalg.lstsq(design, residual, rcond=None)[0]
-        velocities, weights = state.velocities_m_s.copy(), np.ones(len(self.path))
+        if scale is None:
+            step = -np.linalg.lstsq(design, residual, rcond=None)[0]
+        else:
+            grown = np.concatenate([*(each.combination @ each.grown for each in stretches), np.zeros(len(off))])
+            step = np.array([scale / state.scale - 1, *np.zeros(NUM_SHARED - 1)])
+            step[1:] = -np.linalg.lstsq(design[:, 1:], residual + grown * step[0], rcond=None)[0]
+        velocities, weights = state.velocities_m_s.copy(), state.weights.copy()
+        place_errors_m = np.zeros_like(state.place_errors_m)
         for each in stretches:
             velocities[each.photos] = state.velocities_m_s[each.photos] + each.velocities(step)
-            weights[each.before] = each.weights(step)
+            if scale is None:
+                weights[each.before] = each.weights(step)
+            place_errors_m[each.before] = each.place_errors_m(step)
         stddev = float(np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
+        strength = state.reliability * stddev
+        reliability = max(1 - strength**2 * sum(each.strength_of_errors for each in stretches), strength)
         growth = 1 + float(step[SCALE][0])  # the equations are linear in the scale itself, and not in its logarithm
-        if growth < -SIGNIFICANT_STDDEVS * stddev:
+        # Only the first step has its errors in full; later ones may lead too far.
+        if growth < -SIGNIFICANT_STDDEVS * stddev and not state.place_errors_m.any():
             raise GeometryError(
                 f"{self.log.name}: by the accelerations the camera moved the other way than by the photos: have they "
                 "the other sign? at rest they point up, 9.8 m/s^2"
@@ -215,6 +282,8 @@ class InertialProblem:
             state.sensor + step[SENSOR],
             replace(mounting, imu_in_rig_m=mounting.imu_in_rig_m + step[ARM]),
             weights,
+            place_errors_m,
+            reliability,
         )
         return found, stddev
 
@@ -234,22 +303,49 @@ class LinearMotion:
     """The log summed up in k intervals between photos, linearised at a state.
 
     Attributes:
-        state, intervals, errors: at which, of what, and predicted minus measured.
-        shared: (k, 9, 29) derivatives by what all intervals share.
+        problem, state, intervals, errors: of what, at which, between photos, and predicted minus measured.
+        shared: (k, 9, 29) derivatives by what all intervals share; that by the scale is at the most likely places.
+        grown: (k, 9) change of the errors as the map grows.
         late: (k, 9, 2, 1) by how much later than said the photos before and after were taken.
+        rates: (n, 6) of the photos' poses: rad/s in the rig's own frame, and m/s of its origin.
     """
 
+    problem: InertialProblem
     state: InertialState
     intervals: Preintegrated
     errors: MotionErrors
     shared: Array
+    grown: Array
     late: Array
+    rates: Array
 
     def stretches(self, sizes: Sizes) -> list[Stretch]:
         """Return all intervals in stretches of neighbours, given the sizes of the errors."""
         num = len(self.intervals)
         parts = np.array_split(np.arange(num), -(-num // _MAX_NUM_IN_STRETCH))
         return [Stretch.of(rows, self, sizes) for rows in parts]
+
+    def residuals(self, sizes: Sizes, max_num: int) -> Combinations:
+        """Return all combinations that depend neither on velocities nor on gravity's direction, of some stretches.
+
+        Args:
+            max_num: largest number of combinations, if one stretch has no more; the stretches are evenly chosen.
+        """
+        stretches, num = self.stretches(sizes), len(self.intervals)
+        most = max(max_num // max(len(each.free) for each in stretches), 1)
+        chosen = np.unique(np.linspace(0, len(stretches) - 1, most).round().astype(np.int64)).tolist()
+        parts = []
+        for each in (stretches[number] for number in chosen):
+            found = np.zeros((len(each.free), num, 9))
+            found[:, each.rows] = each.free.reshape(-1, len(each.rows), 9)
+            parts.append(found)
+        return self._level(np.concatenate(parts))
+
+    def _level(self, coefficients: Array) -> Combinations:
+        """Return those (c, k, 9) combinations of combinations that do not depend on gravity's direction."""
+        by_direction = self.errors.by_gravity @ self.state.horizontal
+        seen = np.linalg.qr(np.tensordot(coefficients, by_direction, axes=2), mode="complete")[0]
+        return Combinations(np.tensordot(seen[:, 2:].T, coefficients, axes=1), self)
 
     def combined(self, sizes: Sizes, max_num: int, *, keeps_direction: bool) -> Combinations:
         """Return the few combinations of all errors that tell what all intervals share.
@@ -259,7 +355,6 @@ class LinearMotion:
             keeps_direction: whether they depend on gravity's direction; otherwise what does is left out.
         """
         stretches, num = self.stretches(sizes), len(self.intervals)
-        by_direction = self.errors.by_gravity @ self.state.horizontal
         parts = []
         for group in np.array_split(np.arange(len(stretches)), min(max(max_num // NUM_SHARED, 1), len(stretches))):
             of_group = [stretches[number] for number in group]
@@ -270,10 +365,7 @@ class LinearMotion:
                 found[:, each.rows] = (basis[first:last].T @ each.combination).reshape(-1, len(each.rows), 9)
             parts.append(found)
         coefficients = np.concatenate(parts)
-        if not keeps_direction:
-            seen = np.linalg.qr(np.tensordot(coefficients, by_direction, axes=2), mode="complete")[0]
-            coefficients = np.tensordot(seen[:, 2:].T, coefficients, axes=1)
-        return Combinations(coefficients, self)
+        return Combinations(coefficients, self) if keeps_direction else self._level(coefficients)
 
 
 @dataclass(frozen=True)
@@ -319,19 +411,25 @@ class Stretch:
     """Neighbouring intervals whose velocities are eliminated together.
 
     Attributes:
-        rows: (m,) of the intervals. before: (m,) photos before each. photos: (q,) all of them.
-        residual: (9 m,). shared: (9 m, 29). lower: (9 m, 9 m) Cholesky factor of their covariance.
-        by_velocity: (9 m, 3 q).
+        rows: (m,) of the intervals. before, after: (m,) photos before and after each. photos: (q,) all of them.
+        residual, grown: (9 m,). shared: (9 m, 29). lower: (9 m, 9 m) Cholesky factor of their covariance.
+        by_velocity: (9 m, 3 q). of_places: (3 q, 9 m) covariance of the errors of photos' places with these errors.
+        strength_of_errors: expected square of what errors of the most likely places would add to the derivative by the
+            scale, in standard deviations of the errors, without what velocities explain.
         combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1.
     """
 
     rows: Indices
     before: Indices
+    after: Indices
     photos: Indices
     residual: Array
+    grown: Array
     shared: Array
     lower: Array
     by_velocity: Array
+    of_places: Array
+    strength_of_errors: float
     combination: Array
 
     @classmethod
@@ -346,11 +444,11 @@ class Stretch:
                 found[np.arange(num), :, np.searchsorted(photos, photo)] += values[:, :, side]
             return found.reshape(9 * num, -1)
 
-        of_poses = np.repeat([sizes["pose_turns"], sizes["pose_places"]], 3)
-        noise = np.hstack(
-            [of_photos(motion.errors.by_pose[rows] * of_poses), of_photos(motion.late[rows] * sizes["photo_times"])]
-        )
-        total = noise @ noise.T
+        by_pose = of_photos(motion.errors.by_pose[rows])
+        late, places = of_photos(sizes["photo_times"] * motion.late[rows]), np.tile(np.arange(6) >= 3, len(photos))
+        of_poses = motion.problem.bent_poses(photos, motion.state.scale)
+        of_poses += np.diag(np.where(places, sizes["pose_places"], sizes["pose_turns"]) ** 2)
+        total = by_pose @ of_poses @ by_pose.T + late @ late.T
         blocks = total.reshape(num, 9, num, 9)  # a view
         densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
         of_intervals = motion.intervals.subset(rows).covariance(densities)
@@ -364,10 +462,20 @@ class Stretch:
         turned, strengths, _ = np.linalg.svd(left - basis @ (basis.T @ left), full_matrices=False)
         turned = turned[:, strengths > UNDETERMINED]
         combination = solve_triangular(lower, turned, lower=True, trans=1).T
-        return cls(rows, before, photos, motion.errors.residual[rows].ravel(), own, lower, by_velocity, combination)
+        # Places err by those of the poses, and where the camera was at another time.
+        moved = block_diag(*(sizes["photo_times"] * motion.rates[photos, 3:, None]))
+        of_places = of_poses[places] @ by_pose.T + moved @ late.T
+        whitened = solve_triangular(lower, np.hstack([by_pose[:, places], of_places.T]), lower=True)
+        effects, with_places = np.split(whitened - basis @ (basis.T @ whitened), 2, axis=1)
+        left_m2 = of_poses[np.ix_(places, places)] + moved @ moved.T - with_places.T @ with_places
+        strength = float(np.einsum("ia,ab,ib->", effects, left_m2, effects, optimize=True))
+        residual, grown = motion.errors.residual[rows].ravel(), motion.grown[rows].ravel()
+        return cls(
+            *(rows, before, after, photos, residual, grown, own, lower, by_velocity, of_places, strength, combination)
+        )
 
     def _left(self, step: Array) -> Array:
-        return self.residual + self.shared @ step
+        return self.residual + self.grown * step[SCALE] + self.shared[:, GRAVITY.start :] @ step[GRAVITY.start :]
 
     def velocities(self, step: Array) -> Array:
         """Return the (q, 3) most likely changes of the velocities after a step (29,) of the shared numbers."""
@@ -375,9 +483,26 @@ class Stretch:
         basis, upper = np.linalg.qr(whitened[:, :-1])
         return -np.asarray(solve_triangular(upper, basis.T @ whitened[:, -1])).reshape(-1, 3)
 
+    @property
+    def free(self) -> Array:
+        """(r, 9 m) all combinations that do not depend on velocities, with a covariance of 1."""
+        num = self.by_velocity.shape[1]
+        basis = np.linalg.qr(solve_triangular(self.lower, self.by_velocity, lower=True), mode="complete")[0]
+        return np.asarray(solve_triangular(self.lower, basis[:, num:], lower=True, trans=1).T)
+
+    def place_errors_m(self, step: Array) -> Array:
+        """Return the (m, 2, 3) most likely errors of the places of the photos before and after each interval."""
+        whitened = solve_triangular(self.lower, self._errors(step), lower=True)
+        errors_m = self.of_places @ solve_triangular(self.lower, whitened, lower=True, trans=1)
+        ends = np.searchsorted(self.photos, np.column_stack([self.before, self.after]))
+        return np.asarray(errors_m.reshape(-1, 3)[ends])
+
+    def _errors(self, step: Array) -> Array:
+        return self._left(step) + self.by_velocity @ self.velocities(step).ravel()
+
     def weights(self, step: Array) -> Array:
         """Return the (m,) robust weights of the intervals after a step."""
-        left = (self._left(step) + self.by_velocity @ self.velocities(step).ravel()).reshape(-1, 9)
+        left = self._errors(step).reshape(-1, 9)
         covariance = self.lower @ self.lower.T
         own = covariance.reshape(len(left), 9, len(left), 9)[np.arange(len(left)), :, np.arange(len(left))]
         squared = np.einsum("ki,kij,kj->k", left, np.linalg.inv(own), left)

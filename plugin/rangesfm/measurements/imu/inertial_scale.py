@@ -19,6 +19,7 @@ from rangesfm.measurements.imu.inertial_fit import (
     Combinations,
     InertialProblem,
     InertialState,
+    LinearMotion,
     Sizes,
 )
 from rangesfm.measurements.imu.inertial_motions import motions_on_map
@@ -38,7 +39,6 @@ from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_f
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.ranges.errors.components import component_words
-from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.mistakes import MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component
@@ -61,14 +61,11 @@ class InertialScale(KindOnMap):
     """A log on the path of a map, whose scale and upward direction it tells.
 
     Attributes:
-        problem: the log on the path. bending: of the map.
-        metres_per_unit: units of the path in one unit of that which ``bending`` has.
+        problem: the log on the path.
         state: the most likely one. sizes: of the errors with which it was found. intervals: the log summed up there.
     """
 
     problem: InertialProblem
-    bending: MapBending
-    metres_per_unit: float
     state: InertialState
     sizes: Sizes
     intervals: Preintegrated
@@ -91,14 +88,15 @@ class InertialScale(KindOnMap):
     @cached_property
     def alone(self) -> JointMap:
         """The map by the log alone."""
-        return fit_kinds((self,), self.problem.path, self.start, self.bending)
+        return fit_kinds((self,), self.problem.path, self.start, self.problem.bending)
 
     @cached_property
     def upward(self) -> Gravity:
         """The upward direction in the first camera, as exactly as the errors let the log and the map tell it."""
-        observed, combinations = self._observed(self.state.scale, keeps_direction=True)
+        combinations = self._motion(self.state.scale).combined(self.sizes, _NUM_OBSERVATIONS, keeps_direction=True)
+        observed = self._observations(combinations)
         across = combinations.of(combinations.motion.errors.by_gravity @ self.state.horizontal)
-        problem = replace(joined([observed], self.bending), sizes=self.alone.problem.sizes)
+        problem = replace(joined([observed], self.problem.bending), sizes=self.alone.problem.sizes)
         # The direction is that of the most likely state; how far off it may be is known as for a mistake in it.
         stddev = float(np.linalg.norm(problem.mistake(across).stddevs)) / np.sqrt(2) / GRAVITY_M_S2
         down = self.problem.path.world_from_cam[0].T @ self.state.gravity_m_s2
@@ -107,7 +105,7 @@ class InertialScale(KindOnMap):
     def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
         """Linearise about the scale of a placement; what depends on gravity's direction is left out."""
         del in_site
-        return self._observed(placed.scale, max_num)[0]
+        return self._observations(self._motion(placed.scale).combined(self.sizes, max_num, keeps_direction=False))
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
         """Return the tests of scale and vertical against other kinds, and whether log and photos are of one motion."""
@@ -150,7 +148,7 @@ class InertialScale(KindOnMap):
 
     def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
         """Yield the motions between the photos of a map that may bend."""
-        state, placed, sizes = self.state, on_map.estimate, self.sizes
+        state, placed, sizes = self.state, on_map.estimate, on_map.problem.sizes
         in_world = replace(
             state,
             velocities_m_s=state.velocities_m_s @ placed.rotation.T,
@@ -181,38 +179,42 @@ class InertialScale(KindOnMap):
         }
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
 
-    def _observed(
-        self, scale: float, max_num: int = _NUM_OBSERVATIONS, *, keeps_direction: bool = False
-    ) -> tuple[Observations, Combinations]:
-        """Return the observations at a scale, weighted by the sizes of the errors, and of what they are made."""
-        problem, state = self.problem, replace(self.state, scale=scale)
-        motion = problem.linearized(state, self.intervals)
-        made = motion.combined(self.sizes, max_num, keeps_direction=keeps_direction)
+    @property
+    def residuals(self) -> Observations:
+        """All that the log says of some stretches of photos, which shows the sizes of errors best."""
+        return self._observations(self._motion(self.state.scale).residuals(self.sizes, MAX_NUM_OBSERVATIONS))
+
+    def _motion(self, scale: float) -> LinearMotion:
+        state = self.problem.at_scale(scale, self.state, self.intervals, self.sizes)
+        return self.problem.linearized(state, self.intervals)
+
+    def _observations(self, made: Combinations) -> Observations:
+        """Return the observations that are made of all errors."""
+        problem, motion, state = self.problem, made.motion, made.motion.state
         path, by_pose = problem.path, made.by_photos(motion.errors.by_pose, len(problem.path))
-        by_pose[:, :, 3:] = scale * self.metres_per_unit * by_pose[:, :, 3:] @ path.world_from_cam[0]
         of_shared, nothing = made.of(motion.shared), np.zeros(0, dtype=np.int64)
         components = tuple(self._components(made, by_pose, of_shared))
+        by_shift = state.scale * problem.metres_per_unit * by_pose[:, :, 3:] @ path.world_from_cam[0]
         known = [each.alike for each in components if each.spread == 0]
         assumed = [self.sizes[each.name] ** 2 * each.alike for each in components if each.name in self.sizes]
         covariance = np.asarray(np.sum([*known, *assumed], axis=0))
-        found = Observations(
+        return Observations(
             kind=IMU,
             columns=Columns(0, -1, nothing, nothing, 1),
             design=of_shared[:, SCALE],
             # Constant errors of the sensor are about what was known of it before.
             residual_m=made.of(motion.errors.residual) - of_shared @ problem.off_prior(state),
-            by_pose=by_pose.reshape(len(by_pose), -1),
+            by_pose=np.concatenate([by_pose[:, :, :3], by_shift], axis=2).reshape(len(by_pose), -1),
             components=components,
             alone_m2=covariance,
             is_used=np.ones(len(by_pose), dtype=bool),
         )
-        return found, made
 
     def _components(self, made: Combinations, by_pose: Array, of_shared: Array) -> Iterator[Component]:
         """Yield the errors of observations, those of one standard deviation where it is learnt.
 
         Args:
-            by_pose: (c, n, 6). of_shared: (c, 29) derivatives by what is shared.
+            by_pose: (c, n, 6) derivatives by poses, shifts in metres. of_shared: (c, 29) by what is shared.
         """
         motion, prior, num = made.motion, self.problem.prior, len(by_pose)
         times_s = self.problem.times_s[motion.intervals.before]
@@ -247,11 +249,8 @@ class InertialScale(KindOnMap):
             yield Component(name, stddev**2 * columns @ columns.T)
 
 
-def scale_by_sensor(problem: InertialProblem, bending: MapBending, metres_per_unit: float = 1.0) -> InertialScale:
+def scale_by_sensor(problem: InertialProblem) -> InertialScale:
     """Fit a log to the path of a map, with the sizes of the errors that it shows.
-
-    Args:
-        metres_per_unit: as of ``InertialScale``.
 
     Raises:
         GeometryError: log and photos have no time in common, or do not tell the scale.
@@ -264,9 +263,10 @@ def scale_by_sensor(problem: InertialProblem, bending: MapBending, metres_per_un
     state = problem.first_state
     for _ in range(NUM_REWEIGHTINGS):
         state = problem.likeliest(state, sizes)
-        found = InertialScale(problem, bending, metres_per_unit, state, sizes, problem.summed_up(state, sizes))
-        learnt = joined([found.observed(found.start, in_site=False, max_num=_NUM_OBSERVATIONS)], bending).learnt().sizes
-        before, sizes = sizes, {name: learnt[name] for name in sizes}
+        found = InertialScale(problem, state, sizes, problem.summed_up(state, sizes))
+        learnt, before = joined([found.residuals], problem.bending).learnt(), sizes
+        sizes = {name: learnt.sizes[name] for name in sizes}
+        problem = replace(problem, bending_factor=learnt.bending_factor)
         if max(abs(np.log(sizes[name] / before[name])) for name in sizes) < _SAME_SIZE:
             break
     return found
