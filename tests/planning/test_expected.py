@@ -9,7 +9,7 @@ import pytest
 from tests.known import known
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned
 
-from rangesfm.diagnostics.finished_map import by_similarity
+from rangesfm.diagnostics.place import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.measurements.lengths.lengths_on_map import BENDING

@@ -10,7 +10,7 @@ from unittest.mock import patch
 import numpy as np
 from tests.simulated.surveys import MadeSurvey
 
-from rangesfm.diagnostics.finished_map import by_similarity
+from rangesfm.diagnostics.place import by_similarity
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate

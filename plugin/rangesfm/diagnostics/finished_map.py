@@ -7,7 +7,6 @@ broken it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -15,12 +14,13 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
+from rangesfm.diagnostics.place import Place, by_similarity, place_in_words
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
-from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
-from rangesfm.util.geometry.similarity import path_shape, similarity_motions
+from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.similarity import path_shape
 from rangesfm.util.geometry.trajectory import Trajectory
 
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
@@ -34,25 +34,6 @@ _MAX_POINTS_GROWTH = 2.0
 _MAX_RESIDUAL_GROWTH = 2.0
 # A keyframe hangs loose on the map if it is this many times less certain than the median one.
 _LOOSE = 10.0
-
-
-@dataclass(frozen=True)
-class Place:
-    """The map's place in the site's frame, with its uncertainty.
-
-    Attributes:
-        verdict: "good" or "doubtful".
-        reasons: why, in words.
-        stddev_m: (3,) standard deviations of the map's middle in x, y, z.
-        heading_stddev_deg: standard deviation of the map's rotation about z.
-        worst_keyframe_stddev_m: of the keyframe with the least certain position: root of its summed variances.
-    """
-
-    verdict: str
-    reasons: tuple[str, ...]
-    stddev_m: tuple[float, float, float]
-    heading_stddev_deg: float
-    worst_keyframe_stddev_m: float
 
 
 def doubts_of_map(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
@@ -110,7 +91,6 @@ def place_of_map(
         of_keyframes = found.centers_m2(path.frame_ids)
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
-    heading_deg = float(np.rad2deg(stddevs[3]))
     bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
     keyframes_m = np.sqrt(keyframes_m2 + bent_m2)
     worst_m = float(keyframes_m.max())
@@ -119,8 +99,13 @@ def place_of_map(
     in_words, is_wide = place_in_words(stddevs, worst_m, size_m)
     loose = _loose_ones(path, keyframes_m) if is_wide else ()
     reasons = (*((in_words,) if is_wide or not doubts else ()), *loose, *doubts)
-    x_m, y_m, z_m = stddevs[4:].tolist()
-    return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
+    return Place(
+        verdict="doubtful" if is_wide or doubts else "good",
+        reasons=reasons,
+        stddev_m=stddevs[4:].tolist(),
+        heading_stddev_deg=float(np.rad2deg(stddevs[3])),
+        worst_keyframe_stddev_m=worst_m,
+    )
 
 
 def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
@@ -135,37 +120,6 @@ def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
         f"the photos hardly tie keyframe {loose} to the map; each other keyframe is known to {others_m:.2g} m or "
         "better (95 %)"
     )
-
-
-def place_in_words(stddevs: Array, worst_m: float, size_m: float) -> tuple[str, bool]:
-    """Return how well a map's place is known, in words, and whether that is too little to call it good.
-
-    Args:
-        stddevs: (7,) of the map's similarity about its middle. worst_m: standard deviation of the position of the least
-            certain keyframe. size_m: of the site.
-    """
-    half_widths = NORMAL_95 * np.array([np.linalg.norm(stddevs[4:]), np.rad2deg(stddevs[3]), worst_m])
-    place, heading, worst = (
-        f"{half_width:.2g} {unit}" if np.isfinite(half_width) else "nothing"
-        for half_width, unit in zip(half_widths, ("m", "deg", "m"), strict=True)
-    )
-    words = f"the map's place is known to {place}, its heading to {heading}, each keyframe to {worst} or better (95 %)"
-    # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
-    most_m, most_deg = DOUBTFUL_ABOVE * size_m, np.rad2deg(DOUBTFUL_ABOVE)
-    limit = ""
-    if half_widths[2] > most_m:
-        limit = f"each keyframe has to be known to {most_m:.2g} m, {100 * DOUBTFUL_ABOVE:g} % of the site's size"
-    elif half_widths[1] > most_deg:
-        limit = f"the heading has to be known to {most_deg:.2g} deg"
-    return words + (f"; to be good, {limit}" if limit else ""), bool(limit)
-
-
-def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
-    """Return the covariance (7, 7) about the middle of the centres and (n, 3, 3) of each, for a rigid map."""
-    from_first = similarity_motions(centers_m - centers_m[0])
-    to_middle = np.eye(7)
-    to_middle[4:] = from_first.mean(axis=0)
-    return to_middle @ placement @ to_middle.T, from_first @ placement @ np.swapaxes(from_first, 1, 2)
 
 
 def why_broken(

@@ -11,7 +11,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
-from rangesfm.diagnostics.finished_map import Place
+from rangesfm.diagnostics.place import Place
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by

@@ -53,7 +53,7 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
     estimate = found.estimate
     return ResultSummary(
         scale=entries.ScaleEntry.model_validate(estimate),
-        place=None if found.place is None else entries.PlaceEntry.model_validate(found.place),
+        place=found.place,
         metric_from_sfm=_similarity(estimate.metric_from_sfm),
         frame="site" if estimate.frame == "site" else "first_camera",
         map=entries.MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),

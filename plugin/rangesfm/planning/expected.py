@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.diagnostics.finished_map import by_similarity
+from rangesfm.diagnostics.place import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.free_fit import GraphBending
 from rangesfm.estimation.scale.scale_estimate import Verdict, judge

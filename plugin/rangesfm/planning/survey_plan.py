@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.diagnostics.finished_map import place_in_words
+from rangesfm.diagnostics.place import place_in_words
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words

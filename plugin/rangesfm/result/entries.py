@@ -249,16 +249,6 @@ class CheckRangesEntry(CheckEntry):
     per_anchor: dict[Text, CheckEntry]
 
 
-class PlaceEntry(Record):
-    """Uncertainty of the map's place in the site frame, with a verdict; see Place."""
-
-    verdict: Literal["good", "doubtful"]
-    reasons: tuple[Text, ...]
-    stddev_m: Vector
-    heading_stddev_deg: Number
-    worst_keyframe_stddev_m: Number
-
-
 class LoopsEntry(Record):
     """Summary of the closing of loops; see LoopClosure. ``loops.csv`` names the pairs.
 

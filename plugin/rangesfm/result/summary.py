@@ -16,6 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.diagnostics.place import Place
 from rangesfm.errors import number_text
 from rangesfm.result import entries
 from rangesfm.result.comparison_row import ComparisonRow
@@ -55,7 +56,7 @@ class ResultSummary(Record):
     NAME: ClassVar[str] = "result.json"
 
     scale: entries.ScaleEntry
-    place: entries.PlaceEntry | None
+    place: Place | None
     metric_from_sfm: entries.SimilarityEntry
     frame: Literal["site", "first_camera"]
     map: entries.MapEntry

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.diagnostics.finished_map import by_similarity
+from rangesfm.diagnostics.place import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 
