@@ -83,7 +83,8 @@ def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
     if timed and len(timed) < len(surveys):
         bare = next(survey for survey in surveys if survey.path.timestamps_s is None)
         raise InputError(f"its photos have no times, but those of {timed[0].name} have", bare.result.path)
-    return _with_names_of_their_own(_with_tags_of_their_own(surveys))
+    surveys, counts = _with_tags_of_their_own(surveys), Counter(name for one in surveys for name in one.own_name)
+    return surveys if max(counts.values(), default=1) == 1 else list(map(_renamed, surveys))
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
@@ -127,11 +128,6 @@ def _unscaled_model(result: ResultFolder) -> pycolmap.Reconstruction:
 
 def _registered(model: pycolmap.Reconstruction) -> set[str]:
     return {image.name for image in model.images.values() if image.has_pose}
-
-
-def _with_names_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
-    counts = Counter(name for survey in surveys for name in survey.own_name)
-    return list(surveys) if max(counts.values(), default=1) == 1 else list(map(_renamed, surveys))
 
 
 def _renamed(survey: FinishedRun) -> FinishedRun:

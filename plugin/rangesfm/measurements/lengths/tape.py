@@ -16,9 +16,6 @@ CLICKED_STDDEV_PX = 1.0
 FOUND_STDDEV_PX = 0.3
 """Standard deviation of a coordinate of a tag's corner that was found by OpenCV."""
 
-# A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
-_DISAGREES = 3.0
-
 
 @dataclass(frozen=True)
 class TapedDistance:

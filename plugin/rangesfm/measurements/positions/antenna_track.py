@@ -9,6 +9,7 @@ from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.association import is_too_long, places_on_path
@@ -16,7 +17,7 @@ from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.photo_names import rows_of_photos
-from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around
 
 
@@ -59,9 +60,12 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     if times_s is None or len(path) < 2:
         at_s = before.astype(np.float64)
     else:
-        velocity = _velocities(times_s, path.centers, before, after, fraction)
+        at_keyframes = np.gradient(path.centers, times_s, axis=0, edge_order=2 if len(path) > 2 else 1)
+        velocity = (1 - fraction)[:, None] * at_keyframes[before] + fraction[:, None] * at_keyframes[after]
         at_s = times_s[before] if track.log.timestamp_s is None else _times_s(track)[rows]
     names = _names(track)
+    places = AntennaPlaces(before, after, fraction, np.zeros(k), on_path.offsets)
+    parts = places.by_pose(Poses(path.world_from_cam, path.centers), arms_m, np.tile(np.eye(3), (k, 1, 1)))
     return KnownPositions(
         names=tuple(names[row] for row in rows.tolist()),
         is_mark=np.zeros(k, dtype=bool),
@@ -78,9 +82,9 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         clock_stddev_s=np.full(k, track.offset_stddev_s),
         velocity=velocity,
         world_from_cam=path.world_from_cam[np.where(fraction < 0.5, before, after)],
-        by_pose=_by_shifts(before, after, fraction, len(path)),
-        arms_by_pose=_by_turns(path, track.antenna_in_cam_m, before, after, fraction),
-        on_path=np.column_stack([before, after]),
+        by_pose=_sparse(parts * [0, 0, 0, 1, 1, 1], places.keyframes, len(path)),
+        arms_by_pose=_sparse(parts * [1, 1, 1, 0, 0, 0], places.keyframes, len(path)),
+        on_path=places.keyframes,
         fraction=fraction,
         from_line=on_path.offsets,
     )
@@ -117,29 +121,9 @@ def _places(track: AntennaTrack, path: Trajectory) -> tuple[Indices, Indices, In
     return rows, before[rows], after[rows], np.where(is_at, 0.0, fraction)[rows]
 
 
-def _velocities(times_s: Array, centers: Array, before: Indices, after: Indices, fraction: Array) -> Array:
-    """Return (k, 3) velocities along the path, between those at the keyframes before and after."""
-    at_keyframes = np.gradient(centers, times_s, axis=0, edge_order=2 if len(times_s) > 2 else 1)
-    share = fraction[:, None]
-    return np.asarray((1 - share) * at_keyframes[before] + share * at_keyframes[after])
-
-
-def _by_shifts(before: Indices, after: Indices, fraction: Array, num: int) -> csr_array:
-    """Return the (3 k, 6 n) derivatives of the places by shifts of the poses."""
-    rows, axes = 3 * np.arange(len(before))[:, None] + np.arange(3), 3 + np.arange(3)
-    parts = [(1 - fraction, before), (fraction, after)]
-    values = np.concatenate([np.repeat(share, 3) for share, _ in parts])
-    columns = np.concatenate([(6 * pose[:, None] + axes).ravel() for _, pose in parts])
-    return coo_array((values, (np.tile(rows.ravel(), 2), columns)), shape=(3 * len(before), 6 * num)).tocsr()
-
-
-def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, fraction: Array) -> csr_array:
-    """Return the (3 k, 6 n) derivatives of the lever arms by turns of the poses in their own frames."""
-    cross = -cross_matrices(arm_m[None])[0]
-    rows = 3 * np.arange(len(before))[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
-    values, columns = [], []
-    for share, pose in ((1 - fraction, before), (fraction, after)):
-        values.append((share[:, None, None] * (path.world_from_cam[pose] @ cross)).ravel())
-        columns.append((6 * pose[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)).ravel())
-    shape = (3 * len(before), 6 * len(path))
-    return coo_array((np.concatenate(values), (np.tile(rows.ravel(), 2), np.concatenate(columns))), shape=shape).tocsr()
+def _sparse(parts: Array, on_path: Indices, num: int) -> csr_array:
+    """Return the (3 k, 6 n) derivatives of k places by the poses of a path, given those (k, 3, 2, 6) by two each."""
+    rows = np.broadcast_to(3 * np.arange(len(parts))[:, None, None, None] + np.arange(3)[:, None, None], parts.shape)
+    columns = np.broadcast_to(6 * on_path[:, None, :, None] + np.arange(6), parts.shape)
+    is_any, shape = parts != 0, (3 * len(parts), 6 * num)
+    return coo_array((parts[is_any], (rows[is_any], columns[is_any])), shape=shape).tocsr()

@@ -229,13 +229,9 @@ class MarkedPositions(Measurements):
         return {name: self.points.markers[name] for name in self.names}
 
     @property
-    def _covariance_m2(self) -> Array:
-        beyond_m2 = np.array([self.beyond_m2.get(name, np.zeros((3, 3))) for name in self.names])
-        return np.asarray(self.stddev_m[:, None, None] ** 2 * np.eye(3) + beyond_m2)
-
-    @property
     def weights(self) -> Weights:
-        roots = np.linalg.inv(np.linalg.cholesky(self._covariance_m2))
+        beyond_m2 = np.array([self.beyond_m2.get(name, np.zeros((3, 3))) for name in self.names])
+        roots = np.linalg.inv(np.linalg.cholesky(self.stddev_m[:, None, None] ** 2 * np.eye(3) + beyond_m2))
         return Weights(roots, np.ones(len(self.names)), LEAST_SQUARES)
 
     def linearize(self, state: MapState) -> Linearization:

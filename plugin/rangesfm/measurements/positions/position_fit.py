@@ -178,13 +178,10 @@ def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
         for chosen in map(list, _triples(len(rows))):
             if not any(path_shape(each).is_line for each in (places[chosen], targets[chosen])):
                 candidates.append(align_points(places[chosen], targets[chosen]))
-        best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
+        distances = [np.linalg.norm(each.apply(places) - targets, axis=1).sum() for each in candidates]
+        best = candidates[int(np.argmin(distances))]
         targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
     return best
-
-
-def _distance_sum(similarity: Similarity, places: Array, targets: Array) -> float:
-    return float(np.linalg.norm(similarity.apply(places) - targets, axis=1).sum())
 
 
 def _triples(num: int) -> Iterator[tuple[int, ...]]:

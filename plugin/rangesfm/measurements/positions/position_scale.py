@@ -243,7 +243,9 @@ def _doubts_of_axes(known: KnownPositions) -> Iterator[Doubt]:
     freedom = 3 * len(places) - 7
     if freedom <= 0:
         return
-    here_m, mirrored_m = (_rms_m(places, targets * signs) for signs in ([1, 1, 1], [1, 1, -1]))
+    here_m, mirrored_m = (
+        rms(align_points(places, targets * signs).apply(places) - targets * signs) for signs in ([1, 1, 1], [1, 1, -1])
+    )
     # Chance makes either of two fits of so few positions the better one; errors that last make it so in a flat site.
     by_chance = float(special.fdtri(freedom, freedom, 1 - FALSE_ALARM_RATE))
     if here_m > max(np.sqrt(by_chance), _MIRRORED) * mirrored_m:
@@ -252,10 +254,6 @@ def _doubts_of_axes(known: KnownPositions) -> Iterator[Doubt]:
             f"{here_m:.2g} m: two axes are exchanged, or heights count downwards"
         )
         yield Doubt(reason, "give the positions with x to the east, y to the north and heights upwards")
-
-
-def _rms_m(places: Array, targets: Array) -> float:
-    return rms(align_points(places, targets).apply(places) - targets)
 
 
 def doubts_of_positions(num_used: int, uncertainty: ScaleUncertainty, *, has_check: bool) -> Iterator[Doubt]:
@@ -324,7 +322,10 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
         on_map: all that is measured in the map. against: tests that compare the positions with other kinds.
     """
     left_out = positions.names_left_out
-    rows = [*_of_points(positions, on_map, left_out), *_of_antenna(positions, on_map)]
+    known, threshold = positions.known, positions.threshold
+    points = np.flatnonzero(known.is_mark & (~known.is_check | np.isin(known.names, left_out))).tolist()
+    rows = [_of_point(positions, on_map, _POINT, row, threshold) for row in points]
+    rows += _of_antenna(positions, on_map)
     # Beside others that place the map, check points are compared with the map that all hold.
     if not any(each.places_map and each.kind != positions.kind for each in on_map.kinds):
         rows += _of_check_points(positions, on_map, left_out)
@@ -333,7 +334,9 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
         for row in rows
         if row.rejected and row.subject in left_out
     ]
-    likely = [*_likeliest(rows), *(row for row in rows if row.rejected and row.name == _CHECK_POINT)]
+    of_antenna = [row for row in rows if row.rejected and row.name in _OF_ANTENNA]
+    likely = sorted(of_antenna, key=lambda row: -row.statistic)[:1]
+    likely += [row for row in rows if row.rejected and row.name == _CHECK_POINT]
     reasons += [f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in likely]
     if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
         reasons.append(f"either {'; or '.join(doubted)}: {LOOK_AGAIN}")
@@ -341,14 +344,6 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
     rows += against
     rows.sort(key=lambda row: row.threshold - row.statistic)
     return MistakeTests(tuple(rows), tuple(reasons), of_place=tuple(reasons))
-
-
-def _of_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
-    """Yield the test of each control point against all others."""
-    known = positions.known
-    for row in np.flatnonzero(known.is_mark).tolist():
-        if not known.is_check[row] or known.names[row] in left_out:
-            yield _of_point(positions, on_map, _POINT, row, positions.threshold)
 
 
 def _of_check_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
@@ -365,12 +360,6 @@ def _of_point(positions: PositionScale, on_map: JointMap, kind: str, row: int, t
     found = on_map.problem.mistake(columns)
     far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
     return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
-
-
-def _likeliest(rows: Sequence[MistakeTest]) -> Sequence[MistakeTest]:
-    """Return the mistake of the antenna with the largest statistic, if any was found."""
-    found = [row for row in rows if row.rejected and row.name in _OF_ANTENNA]
-    return sorted(found, key=lambda row: -row.statistic)[:1]
 
 
 def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeTest]:
