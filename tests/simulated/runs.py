@@ -45,7 +45,7 @@ def run_stages(survey: MadeSurvey, seed: int, inputs: RangingInputs | None = Non
     observations = associate(inputs.log, survey.trajectory, inputs.tag_in_cam_m, time_offset_s=survey.time_offset_s)
     path = PathOfModel("sparse/0", survey.model, survey.trajectory, observations)
     run = SurveyRun(settings, inputs, Journal(Progress()))
-    return map_in_metres(run, [path], refine=survey.sfm is not None)[1]
+    return map_in_metres(run, [path], refine=survey.sfm is not None)
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Measured:
             inputs = replace(inputs, tape=Tape())
         run = SurveyRun(SETTINGS, inputs, Journal(Progress()))
         try:
-            return map_in_metres(run, [path], refine=False)[1].estimate
+            return map_in_metres(run, [path], refine=False).estimate
         except GeometryError:
             return None
 

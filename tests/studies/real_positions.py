@@ -53,7 +53,7 @@ def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, Scale
     inputs = RangingInputs(
         NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), None, (), positions=known
     )
-    metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(Progress())), [survey_path], refine=True)[1]
+    metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(Progress())), [survey_path], refine=True)
     return metric.estimate.value, metric.estimate.uncertainty
 
 

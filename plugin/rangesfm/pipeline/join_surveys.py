@@ -268,7 +268,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         paths = paths_of_surveys(finished, log, number, is_check, tags_in_cam_m)
         run = SurveyRun(as_joined, inputs, journal)
-        return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled, must_join=True))
+        return with_results(run, map_in_metres(run, paths, refine=survey.refine.enabled, must_join=True))
 
 
 def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> tuple[tuple[Anchor, ...], str]:

@@ -110,17 +110,17 @@ def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel)
     return with_cause(error, estimate.on_map)
 
 
-def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> tuple[SurveyRun, MetricResult]:
-    """Correct the likeliest mistake and make the map again; return the run and the map unchanged if none was found.
+def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> MetricResult:
+    """Correct the likeliest mistake and make the map again; return the map unchanged if none was found.
 
     The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
     apart the likelier one is corrected, too; the user has asked for it and is told.
     """
     if not metric.diagnosis.causes:
-        return run, metric
+        return metric
     if metric.models:
         run.journal.warn("no mistake is corrected: the map is joined from several models")
-        return run, metric
+        return metric
     cause, rows = metric.diagnosis.causes[0], metric.diagnosis.rows
     inputs, log, correction = run.inputs, run.inputs.log, cause.correction
     known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
@@ -138,11 +138,11 @@ def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> tuple[SurveyRu
         adopted = metric_map(corrected, path, refine=metric.refined is not None)
     except GeometryError as error:
         run.journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
-        return run, metric
+        return metric
     change = number_text(100 * (adopted.estimate.value / metric.estimate.value - 1), "+.2f")
     said = f"adopted: {cause.words}; the scale changed by {change} %, from {metric.estimate.value:.6g}"
     run.journal.warn(said)
-    return corrected, adopted.doubted(Doubt(said))
+    return adopted.doubted(Doubt(said))
 
 
 def _spread(values: float | Array, rows: Indices, num: int) -> Array:

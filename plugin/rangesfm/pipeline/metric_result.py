@@ -17,12 +17,12 @@ from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.sfm.loops.loop_closure import LoopClosure
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel
+from rangesfm.util.geometry.georeference import Georeference
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -195,9 +195,14 @@ class MetricResult:
         """Return how the parts of the refined map err together; None if that is not known."""
         return None if self.kept is None else self.kept.summary.covariance
 
-    def in_site(self, site: Site) -> MetricResult:
-        """Return the same result in the coordinates of a site in whose local frame it is, if they are metres."""
-        offset_m, estimate, refined = site.offset_m, self.estimate, self.refined
+    @property
+    def georeference(self) -> Georeference | None:
+        """Return that of the map, which is that of the anchors if the map is in their frame; None without one."""
+        return self.inputs.site.georeference if self.estimate.frame == "site" else None
+
+    def in_given_coordinates(self) -> MetricResult:
+        """Return the same result in the coordinates of the site in whose local frame it is, if they are metres."""
+        offset_m, estimate, refined = self.inputs.site.offset_m, self.estimate, self.refined
         if estimate.frame != "site" or not offset_m.any():
             return self
         shift = Similarity(1.0, np.eye(3), offset_m)

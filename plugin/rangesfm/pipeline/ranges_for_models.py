@@ -35,15 +35,15 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
     survey = survey.changed({"images.model": model_path.absolute()})
     run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
     times = {} if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
-    run, metric = map_of_model(run, model, refine=False)
-    log, inputs = metric.observations.log, run.inputs
+    metric = map_of_model(run, model, refine=False)
+    log = metric.observations.log
     if log.timestamp_s is not None:
         log = replace(log, timestamp_s=log.timestamp_s + metric.path.offset_s)
     anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
     scaled = metric.estimate.metric_from_sfm
     return ModelRanges(
         log=log.subset(np.isin(metric.observations.status, USED)),
-        tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
+        tags_in_cam_m=dict(zip(log.tag_ids, metric.inputs.tag_in_cam_m, strict=True)),
         anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
         image_times_s=times,

@@ -50,7 +50,8 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         found: what the stages found.
         others: entries that do not follow from it, from ``georeference`` on, and ``distances`` and ``comparison``.
     """
-    estimate = found.estimate
+    estimate, on_map = found.estimate, found.all_measured
+    of_kinds: dict[str, Any] = {kind.kind: entry for kind in on_map.kinds if (entry := kind.entry(on_map))}
     return ResultSummary(
         scale=entries.ScaleEntry.model_validate(estimate),
         place=found.place,
@@ -67,16 +68,9 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests)),
         reliability=_reliability(found),
         models=tuple(_model(model, estimate.metric_from_sfm) for model in found.models),
-        **_entries_of_kinds(found),
+        **of_kinds,
         **others,
     )
-
-
-def _entries_of_kinds(found: MetricResult) -> dict[str, Any]:
-    """Return the own entries of the kinds of measurement, by name."""
-    on_map = found.all_measured
-    of_kinds = {kind.kind: kind.entry(on_map) for kind in on_map.kinds}
-    return {name: entry for name, entry in of_kinds.items() if entry}
 
 
 def _similarity(similarity: Similarity) -> entries.SimilarityEntry:

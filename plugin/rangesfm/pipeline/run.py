@@ -81,7 +81,7 @@ def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> RunRes
         deferred = (output.path / ResultSummary.NAME).exists()
         models = map_keyframes(run.survey, keyframes, run.journal, restart, deferred=deferred)
         paths = tie_by_photos(run, place_ranges(run, models))
-        return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled))
+        return with_results(run, map_in_metres(run, paths, refine=survey.refine.enabled))
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = False) -> list[str]:
@@ -120,19 +120,16 @@ def _from_model(survey: Survey, progress: Progress, *, refine: bool, or_scale: b
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         run = replace(run, survey=with_photos_in_folder(survey, run.journal))
-        return with_results(*map_of_model(run, sfm, refine=refine))
+        return with_results(run, map_of_model(run, sfm, refine=refine))
 
 
-def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) -> tuple[SurveyRun, MetricResult]:
+def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) -> MetricResult:
     """Scale the model that a survey gives, and refine it if asked for; nothing is written.
 
     Args:
         run: the survey.
         sfm: its model.
         refine: whether to refine the map after scaling it.
-
-    Returns:
-        As ``map_in_metres``.
     """
     if run.inputs.needs_times:
         times = times_of_model(run.survey, sfm, run.survey.given_model_path)
@@ -146,7 +143,7 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
 
 def map_in_metres(
     run: SurveyRun, paths: Sequence[PathOfModel], *, refine: bool, must_join: bool = False
-) -> tuple[SurveyRun, MetricResult]:
+) -> MetricResult:
     """Join models with ranges to one map, scale and refine it, and judge it.
 
     Args:
@@ -156,8 +153,8 @@ def map_in_metres(
         must_join: whether it is an error if all others are left out.
 
     Returns:
-        The survey, with the lengths that are in the map, and corrected if a mistake was adopted; and the map, no longer
-        in the local frame of the inputs but in the coordinates that were given, where these are metres.
+        The map, no longer in the local frame of the inputs but in the coordinates that were given, where these are
+        metres. If a mistake was adopted, its inputs are corrected.
     """
     with run.journal.stage("scale"):
         path, verdicts = join_models(run, paths, must_join=must_join)
@@ -172,8 +169,8 @@ def map_in_metres(
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:
-        run, made = with_likeliest_cause(run, made)
-    return run, made.in_site(run.inputs.site)
+        made = with_likeliest_cause(run, made)
+    return made.in_given_coordinates()
 
 
 def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:

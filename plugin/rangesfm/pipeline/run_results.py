@@ -24,12 +24,10 @@ from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_resul
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.steps import DATABASE_NAME
 from rangesfm.solver.installation_checks import recorded_versions
-from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_hashes
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import path_of
-from rangesfm.util.geometry.georeference import Georeference
 from rangesfm.util.geometry.reference import write_reference
 
 
@@ -57,7 +55,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
         InputError: a format of [export] cannot be written, but everything else has been; or a file that a result would
             replace was not written by this tool, and nothing has been written.
     """
-    survey, inputs, journal = run.survey, run.inputs, run.journal
+    survey, journal = run.survey, run.journal
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
     distances = distance_rows(metric)
@@ -67,15 +65,13 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     folder = survey.output.path
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
-            comparison = _comparison(inputs, metric, staged)
-            # The georeference of the anchors is that of the map, if the map is in their frame.
-            georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
-            not_exported = _write_models_and_tables(survey, metric, staged, georeference)
+            comparison = _comparison(metric, staged)
+            not_exported = _write_models_and_tables(survey, metric, staged)
         summary = summary_of(
             metric,
             distances=distances,
             **({"comparison": comparison} if comparison else {}),
-            georeference=georeference,
+            georeference=metric.georeference,
             versions=recorded_versions(),
             settings=recorded_settings(survey),
             inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],
@@ -97,33 +93,27 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     return RunResult(folder, summary, tuple(lines))
 
 
-def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
+def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
     """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
-    if inputs.reference is None:
+    if (reference := metric.inputs.reference) is None:
         return ()
     frame, paths = metric.estimate.frame, {"scaled": metric.trajectory.as_in(metric.scaled)}
     if metric.kept is not None:
         if metric.kept.loops is not None and metric.kept.loops.before is not None:
             paths["refined, loops open"] = metric.kept.loops.before
         paths["refined"] = metric.trajectory.as_in(metric.final)
-    rows = papers_table(paths, inputs.reference, frame=frame)
+    rows = papers_table(paths, reference, frame=frame)
     *_, final = paths.values()
-    in_frame = reference_in_frame(final, inputs.reference, frame=frame)
+    in_frame = reference_in_frame(final, reference, frame=frame)
     if len(in_frame):
         write_reference(in_frame, folder / REFERENCE_NAME)
     return rows
 
 
-def _write_models_and_tables(
-    survey: Survey, found: MetricResult, folder: Path, georeference: Georeference | None
-) -> InputError | None:
+def _write_models_and_tables(survey: Survey, found: MetricResult, folder: Path) -> InputError | None:
     """Write the models, the tables and the export formats of a result into a new folder.
 
     Formats that this result cannot have (points or covariances without any) are left out.
-
-    Args:
-        folder: to write into.
-        georeference: of the result's frame; None without one.
 
     Returns:
         The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
@@ -149,7 +139,7 @@ def _write_models_and_tables(
         database_path=survey.output.path / DATABASE_NAME,
         is_site=found.estimate.frame == "site",
         upward=found.upward,
-        georeference=georeference,
+        georeference=found.georeference,
         center_covariance_m2=found.center_covariance_m2,
     )
     impossible = [] if found.final.num_points3D() else ["ply"]
