@@ -154,10 +154,9 @@ class Expected:
             with np.errstate(invalid="ignore", divide="ignore"):
                 posed = self.planned.posed(self.turned_out(0), gravity=self.gravity)
                 solution = solution_from(posed, self.ranges.solution.fit.state)
-                refuse_ambiguity(solution, [mirrored], None)
+                return refuse_ambiguity(solution, [mirrored], None)
         except GeometryError as error:
             return str(error)
-        return ""
 
     def turned_out(self, seed: int) -> RangeObservations:
         """Return the ranges with errors drawn from those to expect."""
