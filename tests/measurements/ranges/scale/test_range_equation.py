@@ -204,7 +204,7 @@ def test_some_ranges_stand_for_those_of_their_anchor_that_are_left_out(rng: np.r
 def fit_with(information: Array, problem: RangeProblem, state: RangeState) -> RangeFit:
     num = len(problem.range_m)
     columns = range_equation.columns_of([problem])
-    return RangeFit(state, np.zeros(num), np.ones(num), 0.0, information, np.zeros((num, len(information))), columns)
+    return RangeFit(state, np.zeros(num), np.ones(num), 0.0, information, columns)
 
 
 def test_the_covariance_is_the_inverse_of_the_information_in_any_units(rng: np.random.Generator) -> None:

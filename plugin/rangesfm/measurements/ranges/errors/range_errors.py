@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +29,6 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, RobustLoss, robust_stddev
-
-_Errors = TypeVar("_Errors")
-_Fit = TypeVar("_Fit")
 
 # Smallest number of ranges in a stretch whose median shows whether it is off as a whole.
 _MIN_BLOCK = 5
@@ -280,35 +276,6 @@ class RangeErrors:
         """Return the largest relative difference of a range's information from that by other errors."""
         ratio = np.sqrt(self.worth / other.worth) * other.stddev_m / self.stddev_m
         return float(np.max(np.abs(np.log(ratio)), initial=0.0))
-
-
-def fit_with_own_errors(
-    fit: Callable[[_Errors, _Fit | None], _Fit],
-    estimate: Callable[[_Errors, _Fit], _Errors],
-    errors: _Errors,
-    *,
-    max_num_rounds: int,
-    is_last: Callable[[_Errors, _Errors, _Fit], bool] = lambda before, seen, fitted: False,
-) -> tuple[_Fit, _Errors, _Errors]:
-    """Alternate between fitting with given errors and estimating the errors from the fit's residuals.
-
-    Args:
-        fit: returns a fit with these errors, started from the fit before (None at first).
-        estimate: returns the errors that a fit shows, given those it was made with.
-        errors: to start with.
-        is_last: returns whether a fit is good enough, given its errors, those that it shows, and the fit.
-
-    Returns:
-        the last fit, the errors that it was made with, and those that it shows.
-    """
-    fitted = fit(errors, None)
-    seen = estimate(errors, fitted)
-    for _ in range(max_num_rounds - 1):
-        if is_last(errors, seen, fitted):
-            break
-        errors, fitted = seen, fit(seen, fitted)
-        seen = estimate(errors, fitted)
-    return fitted, errors, seen
 
 
 def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[Doubt, ...]:

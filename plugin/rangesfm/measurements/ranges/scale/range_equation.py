@@ -178,7 +178,6 @@ class RangeFit:
         weights: (n,) of the robust loss; 1 for a range that fits.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
-        gradients: (n, p) Jacobian of the residuals in standard deviations, each row times its range's weight and share.
         columns: for each model, which of the p parameters is what; the very first is the logarithm of the scale.
     """
 
@@ -187,7 +186,6 @@ class RangeFit:
     weights: Array
     cost: float
     information: Array
-    gradients: Array
     columns: tuple[Columns, ...]
 
     @property
@@ -355,14 +353,13 @@ class _System:
         """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
         (scaled, _), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
         weights = self.loss.weights(scaled) if weights is None else weights
-        gradients = jacobian * (self.share * weights)[:, None]
+        weighted = jacobian * (self.share * weights)[:, None]
         return RangeFit(
             state=state,
             residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
             weights=weights,
             cost=cost,
-            information=gradients.T @ jacobian + of_priors.T @ of_priors,
-            gradients=gradients,
+            information=weighted.T @ jacobian + of_priors.T @ of_priors,
             columns=self.columns,
         )
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.scale.anchor_plane import is_on_side, mirrored_map, on_side
 from rangesfm.measurements.ranges.scale.range_equation import (
@@ -200,12 +200,10 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
     def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:
         return seen(errors.inflated(residuals_m(fitted.state)), fitted.state)
 
-    def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
-        state = start if before is None else before.state
-        return solve(weighted(given, errors).by_some(rows), state, loss=errors.loss)
-
-    rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_ROUNDS)
-    state = rough.state
+    state, used = start, seen(posed.errors, start)
+    for _ in range(_NUM_ROUNDS):
+        rough = solve(weighted(given, used).by_some(rows), state, loss=used.loss)
+        state, used = rough.state, shown(used, rough)
     for _ in range(MAX_NUM_ROUNDS):
         problem = weighted(given, used)
         fitted = solve(problem, state, loss=used.loss)
