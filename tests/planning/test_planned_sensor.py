@@ -15,6 +15,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
 from rangesfm.measurements.imu.sensor import InertialSensor
+from rangesfm.measurements.imu.sensor_prior import NOISE
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned_sensor import PlannedSensor
@@ -75,6 +76,10 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     assert before.place is not None
     assert plan.place.tilt_stddev_deg < 0.5 * before.place.tilt_stddev_deg
     assert not any(advice.kind == "inertial sensor" for advice in plan.advice)
+    # Phones differ, so that one whose noise is known to be that of most brings more.
+    gyro, accel = NOISE
+    known = replace(survey, sensor=PlannedSensor(gyro_noise=gyro.median, accel_noise=accel.median))
+    assert expect(known).uncertainty.empirical < plan.scale_stddev
 
 
 def test_a_sensor_with_few_photos_is_refused_alone_and_left_out_beside_a_radio() -> None:

@@ -57,15 +57,15 @@ class PlannedSensor(Options, table="imu"):
     def sizes(self) -> Mapping[str, float]:
         """Sizes of the errors that a run would learn, by name."""
         share = _TACTICAL if self.grade == "tactical" else 1.0
-        (gyro, accel), (gyro_walk, accel_walk) = ([share * each.median for each in sizes] for sizes in (NOISE, WALK))
+        (gyro, accel), (gyro_walk, accel_walk) = ([share * each.usual for each in sizes] for sizes in (NOISE, WALK))
         return {
             "gyro_noise": self.gyro_noise or gyro,
             "accel_noise": self.accel_noise or accel,
             "gyro_bias_walk": gyro_walk,
             "accel_bias_walk": accel_walk,
-            "photo_times": PHOTO_TIMES.median,
-            "pose_turns": POSE_TURNS.median,
-            "pose_places": POSE_PLACES.median,
+            "photo_times": PHOTO_TIMES.usual,
+            "pose_turns": POSE_TURNS.usual,
+            "pose_places": POSE_PLACES.usual,
         }
 
     def on_map(self, path: Trajectory, bending: MapBending) -> PlannedScale:

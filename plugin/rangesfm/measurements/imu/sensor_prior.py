@@ -37,6 +37,11 @@ class KnownSize:
     median: float
     spread: float
 
+    @property
+    def usual(self) -> float:
+        """Root mean square of the size over sensors (lognormal)."""
+        return float(self.median * np.exp(self.spread**2))
+
     def about(self, given: float) -> KnownSize:
         """Return the size with a given median, as far apart from it as usual; 0 is what nobody has measured."""
         return replace(self, median=given) if given > 0 else self
