@@ -73,13 +73,6 @@ class KnownPositions:
     def __len__(self) -> int:
         return len(self.names)
 
-    def subset(self, rows: Indices) -> KnownPositions:
-        """Return some of the positions."""
-        chosen: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
-        coordinates = (3 * rows[:, None] + np.arange(3)).ravel()
-        chosen |= {name: getattr(self, name)[coordinates] for name in _SPARSE}
-        return KnownPositions(names=tuple(self.names[row] for row in rows.tolist()), **chosen)
-
     def joined(self, others: KnownPositions) -> KnownPositions:
         """Return these positions followed by others in the same model."""
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in _ARRAYS}
