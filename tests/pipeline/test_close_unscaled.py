@@ -87,8 +87,7 @@ def test_a_model_without_any_measurement_has_its_loops_closed_though_it_was_inte
     assert (tmp_path / "out" / "sparse" / "0" / "points3D.bin").read_bytes() == before
     closed = made.close(listener)
     num_done, num_all = listener.counts[0]
-    assert num_done == num_all  # it has the matches of the interrupted run
-    assert num_done > 10
+    assert num_done == num_all > 0  # it has the matches of the interrupted run
     (line,) = (line for line in listener.lines if line.startswith("loops: "))
     assert "were used to close loops" in line
     assert made.error_m(closed) < 0.4 * open_m

@@ -178,11 +178,16 @@ class _MatchedMap(ABC):
         del known
         return []
 
+    def neighbours(self) -> Mapping[int, Set[int]]:
+        """Return photos that tell the same; as of ``find_in``."""
+        return {}
+
     def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
         if self.finder is None:
             return [], tried
         with self.journal.stage("loops"):
-            return find_in(self.finder, self.matching.match, self.matching.known(), tried, self.alike)
+            matching = self.matching
+            return find_in(self.finder, matching.match, matching.known(), tried, self.alike, self.neighbours())
 
     def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> Self | None:
         self.keep(tried)
@@ -268,6 +273,9 @@ class _UnscaledMap(_MatchedMap):
         if rest is None:
             return None
         return replace(self, at_rest=rest, errors=self.errors if is_last else _errors_alone(rest))
+
+    def neighbours(self) -> Mapping[int, Set[int]]:
+        return self.matching.known()
 
     def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
         matching = self.matching

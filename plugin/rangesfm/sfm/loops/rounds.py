@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import product
+from types import MappingProxyType
 from typing import Protocol, TypeVar
 
 from rangesfm.arrays import Indices
@@ -82,6 +84,7 @@ def find_in(
     known: Mapping[int, Set[int]],
     tried: TriedPairs,
     alike: Callable[[Mapping[int, Set[int]]], list[Pair]] = lambda _: [],
+    neighbours: Mapping[int, Set[int]] = MappingProxyType({}),
 ) -> tuple[list[Loop], TriedPairs]:
     """Return the loops that match and fit the map, and all pairs that have been tried with those of this round.
 
@@ -93,16 +96,24 @@ def find_in(
         alike: returns pairs of photos that look alike, given for each photo, by its id, those that it is not to be
             paired with: they were matched with it, or the map predicts that they see the same. It is asked once, and of
             photos that were matched with each other only one is tried.
+        neighbours: ids of the photos that tell the same as each photo, by its id. Of the pairs between two
+            neighbourhoods one is tried, and the others only where it does not match.
     """
     matched = {id_: set(others) for id_, others in known.items()}
     for first, second in tried.proposed:
         matched.setdefault(first, set()).add(second)
         matched.setdefault(second, set()).add(first)
     choices = finder.propose(matched, max_num=MAX_NUM_PAIRS) if tried.promise_more else {}
-    proposed = {pair for of_photo in choices.values() for pair in of_photo[:1]}
+    near = {id_: {id_, *others} for id_, others in neighbours.items()}
+    proposed, same = set[Pair](), set[Pair]()
+    for first, second in (of_photo[0] for of_photo in choices.values() if of_photo):
+        if (first, second) not in same:
+            proposed.add((first, second))
+            both = product(near.get(first, {first}), near.get(second, {second}))
+            same.update((min(pair), max(pair)) for pair in both)
     verified = dict(match(sorted(proposed | tried.contradicted)))
-    tied = {photo for pair in verified for photo in pair}
-    more = {pair for photo, of_photo in choices.items() if photo not in tied for pair in of_photo[1:]}
+    tied = {neighbour for pair in verified for photo in pair for neighbour in near.get(photo, {photo})}
+    more = {pair for photo, of_photo in choices.items() if photo not in tied for pair in of_photo}
     if not tried.proposed:
         told = set[int]()  # photos whose neighbours tell the same
         for first, second in alike(finder.predicted(matched)):
