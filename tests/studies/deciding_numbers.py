@@ -221,9 +221,7 @@ def main() -> int:
         with Reads() as reads:
             usual[name] = run()
         read[name] = reads.read
-    for number in numbers(tuple(args.rooms)):
-        if number in done:
-            continue
+    for number in [number for number in numbers(tuple(args.rooms)) if number not in done]:
         lines.append(effect(number, runs, usual, read))
         print(json.dumps(lines[-1]), flush=True)
         if args.out is not None:
