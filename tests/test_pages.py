@@ -19,6 +19,7 @@ import shlex
 import shutil
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -198,6 +199,15 @@ def test_links_lead_to_what_is_there(page: Path) -> None:
         if anchor:
             titles = re.findall(r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
             assert anchor in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_the_numbers_that_decide_are_those_of_the_program() -> None:
+    text = (ROOT / "examples" / "model.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w.]+)\.(\w+)` \| ([\d.]+) \|", text, flags=re.MULTILINE)
+    assert len(rows) >= 10
+    assert {name: getattr(import_module(f"rangesfm.{module}"), name) for module, name, _ in rows} == {
+        name: float(value) for _, name, value in rows
+    }
 
 
 def test_the_pages_are_one_tour() -> None:

@@ -185,7 +185,7 @@ def effect(
         for name, run in runs.items():
             try:
                 change = compared(usual[name], run())
-            except (RangesfmError, np.linalg.LinAlgError, ValueError, IndexError) as error:
+            except (RangesfmError, np.linalg.LinAlgError, TypeError, ValueError, IndexError) as error:
                 said.append(f"{name}: {error}")
                 continue
             changes.append(change)
