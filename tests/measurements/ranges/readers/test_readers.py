@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import read_ranges, reader_names, write_ranges_csv
+from rangesfm.measurements.ranges.readers.measured import REACH_M
 
 any_bytes_in_one_folder = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -357,7 +358,7 @@ def test_only_a_wrong_line_can_spoil_a_good_log_and_is_told(
         st.tuples(
             st.floats(-1e10, 1e10),
             st.text(min_size=1).map(str.strip).filter(lambda text: text.isprintable() and text),
-            st.floats(1e-6, 1e6),
+            st.floats(1e-6, REACH_M),
         ),
         min_size=1,
     )
