@@ -46,7 +46,7 @@ def test_ranges_are_those_to_the_anchor_as_it_is_seen_from_the_first_photo(made:
     image_time_s = known(made.ranges.timestamp_s) + TIME_OFFSET_S
     near = [np.argsort(np.abs(image_time_s - time_s))[:5] for time_s in made.timestamps_s]  # one in ten is obstructed
     distance_m = np.linalg.norm(tags_m - anchor_m, axis=1)
-    np.testing.assert_allclose(np.median(made.ranges.range_m[near], axis=1), distance_m, atol=0.4)
+    np.testing.assert_allclose(np.median(made.ranges.range_m[near], axis=1), distance_m, atol=0.1)
 
 
 def test_a_spot_of_a_wall_looks_alike_in_two_photos() -> None:
