@@ -536,7 +536,6 @@ def small() -> Small:
         of_photos=csr_array(of_photos),
         gradient=np.concatenate([rng.normal(size=12), np.zeros(4)]),
         others=csr_array(rng.normal(size=(9, 16))),
-        num_reprojections=20,
         free=np.zeros((16, 0)),
         free_of_photos=np.zeros((16, 0)),
         size_m=2.0,

@@ -15,6 +15,7 @@ from rangesfm.solver.bending import NO_STEPS, FrameSteps
 from rangesfm.solver.linear_map import Columns, regular
 from rangesfm.solver.normal_equations import HALF_A_REVOLUTION
 from rangesfm.solver.part_errors import PartSteps, map_errors, rows_of, steps_of
+from rangesfm.solver.posterior import JointProblem
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -32,10 +33,9 @@ def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
     problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
     if not isinstance(bending, PhotoBending):
         return NO_STEPS
-    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
-    # What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
-    factor, is_free = min(problem.bending_factor, LARGEST_FACTOR), known.columns.frame >= 0
-    steps = bending.likely_steps(known.pulls @ by_pose, factor, frame_is_free=is_free)
+    steps = bending.likely_steps(
+        known.pulls @ at_rest.by_pose, _factor(problem), frame_is_free=known.columns.frame >= 0
+    )
     firm_m = (at_rest.path.centers + steps.at(bending.frame_ids)[1])[bending.is_firm]
     size = at_rest.metres_per_unit / align_points(unscaled.centers[bending.is_firm], firm_m).scale
     from_first_m = bending.from_first_m
@@ -60,9 +60,8 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
     if not isinstance(bending, PhotoBending):
         return None
-    columns, photos, factor = known.columns, bending.photos, min(problem.bending_factor, LARGEST_FACTOR)
+    columns, photos, variance = known.columns, bending.photos, _factor(problem) ** 2
     linear, noise = problem.among(problem.is_used)
-    by_pose = np.vstack([each.by_pose for each in at_rest.observed.values()])[problem.is_used]
     column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))
     heard = [name for what, name in rest.blocks if what == "anchor" and name in column_of]
     parts = [
@@ -71,11 +70,11 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     ]
     rows, steps = rows_of(parts), steps_of(parts, len(photos.gradient))
     motions, by_unknown = np.zeros((steps.shape[1], 7)), np.zeros((steps.shape[1], columns.num))
-    frames = photos.poses[0].tolist()
+    shifts = dict(zip(photos.poses[0].tolist(), similarity_motions(bending.from_first_m), strict=True))
     for part, own in zip(parts, rows, strict=True):
         if part.kind == "frame":  # a turn about the axes of the world, and a shift of the origin
             motions[own][:3, 1:4] = np.eye(3)
-            motions[own][3:] = similarity_motions(bending.from_first_m[[frames.index(part.id_)]])[0]
+            motions[own][3:] = shifts[int(part.id_)]
         elif part.kind == "anchor" and (at := column_of[str(part.id_)]) >= 0:
             by_unknown[own, at : at + 3] = np.eye(3)
     by_unknown[:, columns.of_map] = motions[:, : len(columns.of_map)]
@@ -86,17 +85,21 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     by_whole = photos.solve(of_whole)
     whole_m2, across_m2 = of_whole.T @ by_whole, steps.T @ by_whole
 
-    def bent(right: Array) -> Array:
-        found = photos.solve(steps @ right - of_whole @ (motions.T @ right))
-        return np.asarray(factor**2 * (steps.T @ found - motions @ (of_whole.T @ found)))
+    def bent(gradients: Array) -> Array:
+        """Return the covariance of the parts with functions of the map's shape, by their derivatives."""
+        found = photos.solve(gradients)
+        return np.asarray(variance * (steps.T @ found - motions @ (of_whole.T @ found)))
 
     def bent_block(part: PartSteps, own: slice) -> Array:
         mixed = across_m2[own] @ motions[own].T
         block = part.covariance(of_blocks) - mixed - mixed.T + motions[own] @ whole_m2 @ motions[own].T
-        return np.asarray(factor**2 * block)
+        return np.asarray(variance * block)
 
-    solved = photos.solve(bending.shape_by_steps(by_pose, frame_is_free=is_free))
-    across = factor**2 * (steps.T @ solved - motions @ (of_whole.T @ solved))
+    def product(right: Array) -> Array:
+        own = bent(steps @ right - of_whole @ (motions.T @ right))
+        return np.asarray(own - observed.T @ (observed @ right) + left @ (covariance @ (left.T @ right)))
+
+    across = bent(bending.shape_by_steps(at_rest.by_pose, frame_is_free=is_free))
     lower = np.linalg.cholesky(regular(noise.covariance_m2))
     observed = solve_triangular(lower, across.T, lower=True)
     left = by_unknown - observed.T @ solve_triangular(lower, linear.design, lower=True)
@@ -104,7 +107,7 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     scale = columns.scale
     return map_errors(
         parts,
-        lambda right: bent(right) - observed.T @ (observed @ right) + left @ (covariance @ (left.T @ right)),
+        product,
         (
             bent_block(part, own) - observed[:, own].T @ observed[:, own] + left[own] @ covariance @ left[own].T
             for part, own in zip(parts, rows, strict=True)
@@ -112,6 +115,14 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
         left @ covariance[scale] / covariance[scale, scale],
         float(np.sqrt(covariance[scale, scale])),
     )
+
+
+def _factor(problem: JointProblem) -> float:
+    """Return the learnt bending over that expected from the photos, of which no map has more than the largest.
+
+    What a map would have to bend by more than maps do is an error of the measurements that they alone do not show.
+    """
+    return min(problem.bending_factor, LARGEST_FACTOR)
 
 
 def _turns_bounded(covariance: Array, columns: Columns) -> Array:

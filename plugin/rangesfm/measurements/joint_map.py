@@ -274,6 +274,11 @@ class JointMap:
         return moved_similarity(self.placed, known.columns.map_step(known.step), self.path)
 
     @property
+    def by_pose(self) -> Array:
+        """(c, 6 n) derivatives by the poses of all observations that are used."""
+        return np.vstack([each.by_pose for each in self.observed.values()])[self.problem.is_used]
+
+    @property
     def scale(self) -> ScaleByKind:
         """Metres per unit of the unscaled model, at the estimate."""
         return self.posterior.uncertainty.about(self.estimate.scale * self.metres_per_unit)

@@ -118,11 +118,12 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             "photos: check that model, photos and camera parameters belong together (rangesfm scale gives the path "
             "alone)"
         )
-    if on_map.is_at_rest:
-        scale = on_map.metres_per_unit if broken else on_map.scale.value
-    else:
+    if not on_map.is_at_rest:
         scale = align_points(path.centers, path.as_in(model).centers).scale
-    if on_map.is_at_rest and not broken:
+    elif broken:
+        scale = on_map.metres_per_unit
+    else:
+        scale = on_map.scale.value
         model, summary = _at_estimate(on_map, model, summary, path)
     return replace(metric, refined=RefinedMap(model, summary, rest.problem.kinds, on_map, scale, broken))
 

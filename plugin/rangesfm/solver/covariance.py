@@ -1,4 +1,4 @@
-"""Covariances of a bundle adjustment with ranges: of poses, anchors, biases and scale."""
+"""Covariances of a bundle adjustment: of all parts of a map, and of what its photos alone leave open."""
 
 from __future__ import annotations
 
@@ -55,15 +55,16 @@ def joint_covariance(
     parts = [*_parts(equations, columns, anchors, refined_params)]
     steps = steps_of(parts, len(equations.gradient))
     is_firm = np.isin(columns.frames, columns.frames if firm_frame_ids is None else firm_frame_ids)
-    by_scale = steps.T @ (solution := variance * inverse.solve(of_scale := _scale_gradient(columns, is_firm)))
-    scale_m2 = float(of_scale[:, 0] @ solution[:, 0])
+    of_scale = _scale_gradient(columns, is_firm)
+    with_scale = variance * inverse.solve(of_scale)[:, 0]
+    by_scale, scale_m2 = steps.T @ with_scale, float(of_scale[:, 0] @ with_scale)
     if scale_m2 < 0:  # as where a solver has thrown points and photos far apart
         raise GeometryError("rounding leaves nothing of how well the map's scale is known: no covariance")
     return map_errors(
         parts,
         lambda right: variance * (steps.T @ inverse.solve(steps @ right)),
         (part.covariance(lambda start: variance * blocks[columns.index_at(start)]) for part in parts),
-        by_scale[:, 0] / scale_m2 if scale_m2 > 0 else by_scale[:, 0],
+        by_scale / scale_m2 if scale_m2 > 0 else by_scale,
         float(np.sqrt(scale_m2)),
     )
 
@@ -121,10 +122,8 @@ class PhotosAlone:
             frame_ids: (k,). by_turn, by_center: (c, k, 3) derivatives by a turn of each frame's rig in its own frame,
                 and by a shift of the rig's origin.
         """
-        gradients, place = (
-            np.zeros((len(self.gradient), len(by_turn))),
-            {f: k for k, f in enumerate(frame_ids.tolist())},
-        )
+        gradients = np.zeros((len(self.gradient), len(by_turn)))
+        place = {frame_id: k for k, frame_id in enumerate(frame_ids.tolist())}
         for frame_id, pose, rows in self._free_poses():
             if (k := place.get(frame_id)) is not None:
                 gradients[rows] = (np.hstack([by_turn[:, k], by_center[:, k]]) @ _pose_from_step(pose)).T

@@ -127,7 +127,6 @@ class NormalEquations:
         of_photos: (size, size) of the reprojection errors. gradient: (size,) of half the sum of their squares, where
             the points follow.
         others: (n, size) Jacobian of all other residuals.
-        num_reprojections: index in the problem of the first of them.
         free, free_of_photos: (size, k) bases of the motions of the world that change no residual, and none of the
             photos'.
         size_m: median distance from the middle of the frames to the points, or to the frames without points.
@@ -138,7 +137,6 @@ class NormalEquations:
     of_photos: Array | csr_array
     gradient: Array
     others: csr_array
-    num_reprojections: int
     free: Array
     free_of_photos: Array
     size_m: float
@@ -183,7 +181,6 @@ class NormalEquations:
             own - explained,
             seen.T @ (residuals - points @ (whitener @ (whitener.T @ (points.T @ residuals)))),
             csr_array(rows[num_reprojections:]),
-            num_reprojections,
             _free_motions(motions, effects)[kept],
             _free_motions(motions, effects[:, :num_reprojections])[kept],
             _size_m(columns),

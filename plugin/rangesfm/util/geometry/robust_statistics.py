@@ -58,12 +58,6 @@ class RobustLoss:
         """Return (n,) weights in (0, 1] of the weighted least squares with the same gradient."""
         return np.asarray(self.rho(scaled_residuals**2)[1])
 
-    def slopes(self, scaled_residuals: Array) -> Array:
-        """Return (n,) derivatives of the root of the loss by the residual, for residuals whose squares are the loss."""
-        rho, first, _ = self.rho(scaled_residuals**2)
-        root = np.sqrt(rho)
-        return np.where(root > 0, first * np.abs(scaled_residuals) / np.maximum(root, 1e-300), 1.0)
-
 
 # Width for 95 % efficiency under Gaussian noise. Used in first rounds, and where a start may be far off.
 CAUCHY = RobustLoss(2.385, is_bounded=False)

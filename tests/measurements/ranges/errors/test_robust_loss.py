@@ -27,14 +27,6 @@ def curvatures(loss: RobustLoss, residuals: npt.NDArray[np.float64]) -> npt.NDAr
 
 
 @BOTH
-def test_slope_is_that_of_the_root_of_the_loss(loss: RobustLoss) -> None:
-    residuals, step = np.linspace(0.1, 12.0, 100), 1e-6
-    root = [np.sqrt(loss.rho((residuals + h) ** 2)[0]) for h in (step, -step)]
-    np.testing.assert_allclose(loss.slopes(residuals), (root[0] - root[1]) / (2 * step), atol=1e-7)
-    np.testing.assert_array_equal(loss.slopes(np.array([0.0])), [1.0])
-
-
-@BOTH
 def test_under_gaussian_noise_it_is_nearly_as_good_as_least_squares(loss: RobustLoss) -> None:
     z, step = np.linspace(-9.0, 9.0, 20_001, retstep=True)
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi) * step
