@@ -33,6 +33,7 @@ NUM_CAMERA_PARAMS = {
 }
 
 _NO_POINT = 2**64 - 1
+_COUNT_BYTES = 8
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _ELEMENT = np.dtype([("image_id", "<u4"), ("feature", "<u4")])
 _POINT = np.dtype([("point_id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
@@ -86,16 +87,20 @@ def read_records(path: Path) -> Records:
         InputError: the file ends before the number of records that it announces. COLMAP would go on reading, and with
             a damaged count run for minutes and fill the memory.
     """
+    start, groups_start, end = list[int](), list[int](), [_COUNT_BYTES]
     try:
         with open_regular(path) as file:
-            cursor = _Cursor(file.read())
-        start, groups_start = [], []
-        for _ in range(cursor.number("Q")):
-            start.append(cursor.place)
-            groups_start.append(_WALKS[path.name](cursor))
+            data = file.read()
+        for _ in range(_number(data, 0, "Q")):
+            start.append(end[-1])
+            groups, stop = _WALKS[path.name](data, start[-1])
+            if stop > len(data):
+                raise ValueError("it ends before")
+            groups_start.append(groups)
+            end.append(stop)
     except (OSError, ValueError, struct.error) as error:
         raise InputError("is damaged or cut off: it announces more than it holds", path) from error
-    return Records(path, cursor.data, start, groups_start, [*start[1:], cursor.place][: len(start)])
+    return Records(path, data, start, groups_start, end[1:])
 
 
 def check_map(images: Records, points: Records) -> None:
@@ -136,65 +141,41 @@ def _sorted_by_place(
     return np.column_stack([place[order], point_id[order]])
 
 
-class _Cursor:
-    """Position in a binary file; moving beyond the end raises struct.error."""
-
-    def __init__(self, data: bytes):
-        self.data = data
-        self.place = 0
-
-    def number(self, code: str) -> int:
-        """Read the next little-endian integer, given its struct code."""
-        (value,) = struct.unpack_from(f"<{code}", self.data, self.place)
-        self.place += struct.calcsize(f"<{code}")
-        return int(value)
-
-    def skip(self, num_bytes: int) -> int:
-        """Skip this many bytes and return the offset where they begin."""
-        start, self.place = self.place, self.place + num_bytes
-        if self.place > len(self.data):
-            raise struct.error
-        return start
+def _number(data: bytes, place: int, code: str) -> int:
+    """Return the little-endian integer at an offset, given its struct code."""
+    return int(struct.unpack_from(f"<{code}", data, place)[0])
 
 
-def _walk_camera(cursor: _Cursor) -> int:
-    cursor.skip(4)
-    model = cursor.number("i")
-    return cursor.skip(16 + 8 * NUM_CAMERA_PARAMS.get(model, 0))
+def _camera(data: bytes, start: int) -> tuple[int, int]:
+    params = start + 24
+    return params, params + 8 * NUM_CAMERA_PARAMS.get(_number(data, start + 4, "i"), 0)
 
 
-def _walk_rig(cursor: _Cursor) -> int:
-    cursor.skip(4)
-    num_sensors = cursor.number("I")
-    start = cursor.skip(8 if num_sensors else 0)
-    for _ in range(num_sensors - 1):
-        cursor.skip(8)
-        cursor.skip(56 if cursor.number("B") else 0)
-    return start
+def _rig(data: bytes, start: int) -> tuple[int, int]:
+    num_sensors, end = _number(data, start + 4, "I"), start + 8
+    for sensor in range(num_sensors):
+        end += 8 if not sensor else 9 + 56 * (_number(data, end + 8, "B") > 0)  # all but the first may have a pose
+    return start + 8, end
 
 
-def _walk_groups(cursor: _Cursor, num_before: int, code: str, size: int) -> int:
-    """Step over a head of ``num_before`` bytes, the number of groups with this struct code, and the groups.
-
-    Returns the offset where the groups begin. Each group has ``size`` bytes.
-    """
-    cursor.skip(num_before)
-    return cursor.skip(cursor.number(code) * size)
+def _with_groups(num_before: int, code: str, size: int, data: bytes, start: int) -> tuple[int, int]:
+    """Step over a head of ``num_before`` bytes, the number of groups with this struct code, and groups of one size."""
+    groups = start + num_before + struct.calcsize(f"<{code}")
+    return groups, groups + size * _number(data, start + num_before, code)
 
 
-def _walk_image(cursor: _Cursor) -> int:
-    """Step over an image, whose head ends in a name terminated by a zero byte."""
-    end = cursor.data.find(b"\0", cursor.place + 64)
-    return _walk_groups(cursor, end + 1 - cursor.place if end >= 0 else len(cursor.data), "Q", _FEATURE.itemsize)
+def _image(data: bytes, start: int) -> tuple[int, int]:
+    name_end = data.index(b"\0", start + 64)
+    return _with_groups(name_end + 1 - start, "Q", _FEATURE.itemsize, data, start)
 
 
-# Functions that step over one record and return the offset where its groups begin.
-_WALKS: dict[str, Callable[[_Cursor], int]] = {
-    "cameras.bin": _walk_camera,
-    "rigs.bin": _walk_rig,
-    "frames.bin": partial(_walk_groups, num_before=64, code="I", size=16),
-    "images.bin": _walk_image,
-    "points3D.bin": partial(_walk_groups, num_before=43, code="Q", size=_ELEMENT.itemsize),
+# Functions that step over the record at an offset of a file's content, and return where its groups begin and end.
+_WALKS: dict[str, Callable[[bytes, int], tuple[int, int]]] = {
+    "cameras.bin": _camera,
+    "rigs.bin": _rig,
+    "frames.bin": partial(_with_groups, 64, "I", 16),
+    "images.bin": _image,
+    "points3D.bin": partial(_with_groups, 43, "Q", _ELEMENT.itemsize),
 }
 MODEL_FILES = tuple(_WALKS)
 """Names of COLMAP's binary model files; each file is a count followed by that many records."""
