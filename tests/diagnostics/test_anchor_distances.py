@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rangesfm.diagnostics.preflight import notes_on_distances
+from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import RangeLog
 
@@ -66,6 +69,13 @@ def test_ranges_of_a_radio_that_reads_seven_percent_and_a_quarter_metre_long_are
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "millimetres"), (1e2, "centimetres"), (1 / 0.3048, "feet")])
 def test_anchors_in_another_unit_are_named_with_it(factor: float, unit: str, by_photo: bool) -> None:
     assert f"probably anchors are in {unit}" in note(log_of_walk(by_photo=by_photo), scaled(factor))
+
+
+def test_a_unit_that_nobody_has_said_ends_the_run_where_it_alone_explains_all() -> None:
+    in_open_unit = Path("anchors.csv")
+    with pytest.raises(InputError, match=r"anchors\.csv: in 10 of 10 pairs .* would not if anchors are in millimetres"):
+        list(notes_on_distances(log_of_walk(), anchors_at(scaled(1e3)), in_open_unit))
+    assert list(notes_on_distances(log_of_walk(), anchors_at({**SITE_M, "C": (8.0, 44.0, 0.8)}), in_open_unit))
 
 
 def test_ranges_in_feet_are_named() -> None:

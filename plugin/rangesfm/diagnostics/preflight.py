@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -56,48 +57,35 @@ _UNITS = {"mm": "millimetres", "cm": "centimetres", "ft": "feet"}
 
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
-    """Return notes for the user on ranges and anchors of a survey; empty if nothing seems wrong."""
-    if len(inputs.log) and not {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
+    """Return notes for the user on ranges and anchors of a survey; empty if nothing seems wrong.
+
+    Raises:
+        InputError: unless the user says in which unit ranges and anchors are, nearly all ranges are farther than radios
+            reach, or only another unit explains why the ranges contradict most distances between anchors.
+    """
+    log, given = inputs.log, survey.ranges
+    unit_is_open = log.format in _WITH_UNIT and given.range_unit is None
+    if unit_is_open and (far := _beyond_reach(log)) is not None:
+        raise InputError(f"{far}, or insist on --range_unit m", given.path)
+    if len(log) and not {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         yield (
             "the tag's place on the camera is not given, so it is taken to be at the lens: ranges are wrong by up to "
             "its distance from there; measure from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
         )
-    for tag_id, arm_m in zip(inputs.log.tag_ids, np.linalg.norm(inputs.tag_in_cam_m, axis=1), strict=True):
+    for tag_id, arm_m in zip(log.tag_ids, np.linalg.norm(inputs.tag_in_cam_m, axis=1), strict=True):
         if arm_m > LARGEST_RIG_M:
             yield (
                 f"the lever arm of {tag_id or 'the tag'} is {arm_m:.3g} m long, more than a camera carries: give it in "
                 "metres from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
             )
-    yield from _on_ranges(inputs.log)
+    yield from _on_ranges(log)
     if inputs.anchor_frame == "unknown":
         return
     surveyed = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors if anchor.position_m is not None}
     yield from _on_positions(surveyed, inputs.site if inputs.anchor_frame == "site" else None)
-    yield from notes_on_distances(inputs.log, inputs.anchors)
+    units_are_said = survey.anchors.unit is not None and not unit_is_open
+    yield from notes_on_distances(log, inputs.anchors, None if units_are_said else survey.anchors.path or given.path)
     yield from _on_taped_anchors(inputs.tape, inputs.anchors)
-
-
-def check_units(survey: Survey, inputs: RangingInputs) -> None:
-    """Check that ranges and anchors are in metres, unless the user says in which unit they are.
-
-    Raises:
-        InputError: nearly all ranges are farther than radios reach, or only another unit explains why the ranges
-            contradict most distances between anchors.
-    """
-    log = inputs.log
-    are_said = survey.anchors.unit is not None and (survey.ranges.range_unit or log.format not in _WITH_UNIT)
-    far = _beyond_reach(log) if log.format in _WITH_UNIT and survey.ranges.range_unit is None else None
-    if far is not None:
-        raise InputError(f"{far}, or insist on --range_unit m", survey.ranges.path)
-    if inputs.anchor_frame == "unknown" or are_said:
-        return
-    contradictions = find_contradictions(log, inputs.anchors)
-    if contradictions is not None and contradictions.are_of_unit:
-        raise InputError(
-            f"{contradictions.found}; they would not if {' or '.join(contradictions.causes)}: give the unit "
-            "(--anchor_unit, --range_unit), or insist with both in m",
-            survey.anchors.path or survey.ranges.path,
-        )
 
 
 def _beyond_reach(log: RangeLog) -> str | None:
@@ -291,59 +279,43 @@ class _Triangles:
         return bad
 
 
-@dataclass(frozen=True)
-class Contradictions:
-    """Distances between anchors that contradict the ranges.
-
-    Attributes:
-        num_pairs, num_bad: pairs of anchors that are compared, and that are contradicted.
-        causes: single mistakes that would explain all.
-        named: the first of the pairs, for the user.
-    """
-
-    num_pairs: int
-    num_bad: int
-    causes: tuple[str, ...]
-    named: str
-
-    @property
-    def found(self) -> str:
-        """What was found, for the user."""
-        num = f"{self.num_bad} of {self.num_pairs} pairs of anchors"
-        return f"in {num}, their coordinates and the ranges contradict each other"
-
-    @property
-    def are_of_unit(self) -> bool:
-        """True if most pairs are contradicted and nothing but another unit explains them."""
-        in_units = all(cause.endswith(tuple(_UNITS.values())) for cause in self.causes)
-        return bool(self.causes) and in_units and 2 * self.num_bad > self.num_pairs
-
-
-def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str]:
-    """Return a note if distances between anchors contradict the ranges: the likeliest reason and what to do."""
-    if (found := find_contradictions(log, anchors)) is not None:
-        likeliest = f"probably {' or '.join(found.causes)}" if found.causes else f"look at {found.named} first"
-        yield f"{found.found}: {likeliest}; check labels, coordinates and units, or the map will be wrong too"
-
-
-def find_contradictions(log: RangeLog, anchors: Sequence[Anchor]) -> Contradictions | None:
-    """Return the distances between anchors that contradict the ranges; None if none does.
+def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor], in_open_unit: Path | None = None) -> Iterator[str]:
+    """Return a note if distances between anchors contradict the ranges: the likeliest reason and what to do.
 
     Two simultaneous ranges of one tag and the distance between their anchors form a triangle: the distance is at most
     the sum of the ranges, and at least their difference. Ranges between two anchors measure the distance directly.
+
+    Args:
+        in_open_unit: file with distances of which nobody has said the unit.
+
+    Raises:
+        InputError: most pairs of anchors are contradicted, and nothing but another unit of that file explains them.
     """
     surveyed = [anchor for anchor in anchors if anchor.position_m is not None and anchor.anchor_id in log.anchor_ids]
     if len(surveyed) < 2:
-        return None
+        return
     ids = [anchor.anchor_id for anchor in surveyed]
     positions_m = np.array([anchor.position_m for anchor in surveyed])
     triangles = _triangles(log, ids)
     bad = triangles.bad_pairs(positions_m)
     if not bad.any():
-        return None
+        return
+    num_bad, num_pairs, causes = (
+        int(bad.sum()),
+        len(ids) * (len(ids) - 1) // 2,
+        [*_causes(triangles, ids, positions_m, bad)],
+    )
+    found = f"in {num_bad} of {num_pairs} pairs of anchors, their coordinates and the ranges contradict each other"
+    are_of_unit = causes and all(cause.endswith(tuple(_UNITS.values())) for cause in causes) and 2 * num_bad > num_pairs
+    if in_open_unit is not None and are_of_unit:
+        raise InputError(
+            f"{found}; they would not if {' or '.join(causes)}: give the unit (--anchor_unit, --range_unit), or insist "
+            "with both in m",
+            in_open_unit,
+        )
     named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED].tolist())
-    causes = tuple(_causes(triangles, ids, positions_m, bad))
-    return Contradictions(len(ids) * (len(ids) - 1) // 2, int(bad.sum()), causes, named)
+    likeliest = f"probably {' or '.join(causes)}" if causes else f"look at {named} first"
+    yield f"{found}: {likeliest}; check labels, coordinates and units, or the map will be wrong too"
 
 
 def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: Mask) -> Iterator[str]:

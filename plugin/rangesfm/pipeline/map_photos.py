@@ -15,7 +15,6 @@ from rangesfm.colmap.model_files import model_of_trajectory, read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.reprojection import wrong_axes
 from rangesfm.diagnostics.preflight import (
-    check_units,
     notes_before_work,
     notes_on_gaps,
     notes_on_model,
@@ -81,9 +80,9 @@ def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
-    check_units(survey, inputs)
+    notes = [*notes_before_work(survey, inputs)]  # it ends the run where a unit is wrong
     journal.note(*inputs.assumed)
-    journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
+    journal.warn(*inputs.notes, *notes)
     return SurveyRun(survey, inputs, journal)
 
 
