@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 PROGRAM = """
 import importlib, os, signal, sys
 from rangesfm.cli import main
-from rangesfm.sfm import snapshots
+from rangesfm.sfm import incremental_mapping
 
 module, name, num_calls, *argv = sys.argv[1:]
 module, left = importlib.import_module(module), int(num_calls)
-snapshots._MIN_INTERVAL_S = snapshots._INTERVAL_OVER_DURATION = 0.0  # the mapping takes a second
+incremental_mapping._MIN_INTERVAL_S = incremental_mapping._INTERVAL_OVER_DURATION = 0.0  # the mapping takes a second
 function = getattr(module, name)
 
 def function_or_death(*arguments, **options):
