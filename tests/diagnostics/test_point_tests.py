@@ -13,11 +13,10 @@ from tests.conftest import SITE_M, WalkedSurvey
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
-from rangesfm.measurements.lengths.map_points import MapPoint
 from rangesfm.measurements.lengths.tape import CLICKED_STDDEV_PX, Marker
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests
-from rangesfm.util.geometry.map_errors import MapPointErrors
+from rangesfm.util.geometry.map_errors import MapPoint
 
 STDDEV_M, NUM_POINTS = 0.01, 6
 
@@ -55,7 +54,7 @@ def marked(walked_survey: WalkedSurvey) -> Marked:
 
 
 def test_points_of_a_map_that_is_not_refined_are_as_far_off_as_it_is_bent() -> None:
-    exact = MapPoint("M", np.zeros(3), MapPointErrors({}, np.zeros((3, 3))))
+    exact = MapPoint(np.zeros(3), {}, np.zeros((3, 3)))
     found = Placed(np.zeros((7, 7)), np.zeros(3), bent_by_m=0.3).joint([exact])
     assert np.trace(found) == pytest.approx(0.3**2)
 

@@ -97,8 +97,8 @@ def scene() -> Scene:
     path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
     poses = model_poses(made.reconstruction, path.frame_ids)
     markers = {f"M{k}": marker for k, marker in enumerate(_markers(made, 3))}
-    points = NamedPoints.in_model(made.reconstruction, path.frame_ids, markers, ["A0", "A1", "A2"])
     ranges, motions = _ranges(path, rng), _motions(path, rng)
+    points = NamedPoints.in_model(made.reconstruction, markers, ranges.placed_anchors, path.frame_ids)
     kinds: dict[str, Measurements] = {
         "range": ranges,
         "position": _positions(path, rng),

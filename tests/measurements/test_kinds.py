@@ -93,7 +93,7 @@ def test_the_compiled_cost_is_that_of_the_weights(name: str, scene: Scene) -> No
 def test_rays_of_exact_marks_meet_in_the_point(scene: Scene) -> None:
     points = [point for point in scene.model.points3D.values() if point.track.length() > 3]
     exact = {f"P{k}": marker_of(scene.model, point) for k, point in enumerate(points)}
-    named = NamedPoints.in_model(scene.model, scene.path.frame_ids, exact)
+    named = NamedPoints.in_model(scene.model, exact, first_ids=scene.path.frame_ids)
     at = [named.at(name, scene.state).position_m for name in exact]
     assert len(at) > 10
     np.testing.assert_allclose(at, [point.xyz for point in points], atol=1e-6)

@@ -29,7 +29,7 @@ from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.cost import Ranges
@@ -200,7 +200,8 @@ class ScaledMap:
     def problem(self, model: pycolmap.Reconstruction, ranges: Ranges, *, is_refined: bool) -> MapProblem:
         """Return the problem of a copy of a map in metres."""
         metric = pycolmap.Reconstruction(model)
-        at = MapToFit.of_model(metric, self.trajectory, RefineOptions(), {}, ranges.placed_anchors)
+        points = NamedPoints.in_model(metric, {}, ranges.placed_anchors, self.trajectory.frame_ids)
+        at = MapToFit(points, self.trajectory, RefineOptions())
         return map_problem(
             metric,
             tuple(measured_by_radio(ranges, at)),

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.solver.test_covariance import Joint, covariance_of_all, joint, model, variable
 
 from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
-from rangesfm.util.geometry.map_errors import MapErrors, MapPointErrors
+from rangesfm.util.geometry.map_errors import MapErrors, MapPoint
 
 Array = npt.NDArray[np.float64]
 
@@ -18,15 +18,15 @@ def found_in(survey: Joint) -> MapErrors:
     return survey.covariance().errors
 
 
-def center_of(frame_id: int) -> MapPointErrors:
-    return MapPointErrors({("frame", frame_id): np.hstack([np.zeros((3, 3)), np.eye(3)])}, np.zeros((3, 3)))
+def center_of(frame_id: int) -> MapPoint:
+    return MapPoint(np.zeros(3), {("frame", frame_id): np.hstack([np.zeros((3, 3)), np.eye(3)])}, np.zeros((3, 3)))
 
 
-def anchor(anchor_id: str) -> MapPointErrors:
-    return MapPointErrors({("anchor", anchor_id): np.eye(3)}, np.zeros((3, 3)))
+def anchor(anchor_id: str) -> MapPoint:
+    return MapPoint(np.zeros(3), {("anchor", anchor_id): np.eye(3)}, np.zeros((3, 3)))
 
 
-def relative(errors: MapErrors, first: MapPointErrors, second: MapPointErrors) -> Array:
+def relative(errors: MapErrors, first: MapPoint, second: MapPoint) -> Array:
     """Return the relative covariance as the problem has it, with its own uncertainty of the scale."""
     return errors.relative(first, second, errors.scale_stddev)
 

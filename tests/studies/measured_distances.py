@@ -34,8 +34,8 @@ from tests.studies.drifting_maps import MAST_M
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.measurements.lengths.map_points import MapPoints
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.pipeline.measure import Measurement, measured
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.util.geometry.gravity import UP_IN_SITE
@@ -126,7 +126,8 @@ def measured_in(
 ) -> tuple[Measurement, ...]:
     assert metric.kept is not None
     anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
-    points = MapPoints(metric.final, anchors_m, markers, metric.kept.summary.pixel_stddev)
+    pixel_stddev = metric.kept.summary.pixel_stddev
+    points = NamedPoints.in_model(metric.final, markers, anchors_m, pixel_stddev=pixel_stddev)
     up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
     return measured(points, pairs, metric.map_errors, metric.estimate.uncertainty.empirical, up)
 

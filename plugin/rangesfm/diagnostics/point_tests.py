@@ -11,13 +11,13 @@ from scipy import special
 from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.lengths.map_points import MapPoint, MapPoints
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import MapErrors, MapPoint
 from rangesfm.util.geometry.similarity import similarity_motions
 from rangesfm.util.processes.threads import with_one_blas_thread
 
@@ -48,7 +48,7 @@ class Placed:
 
     def joint(self, points: Sequence[MapPoint]) -> Array:
         """Return the (3 k, 3 k) covariance of points of a map that is not refined."""
-        own = [point.errors.own_m2 + self.bent_by_m**2 / 3 * np.eye(3) for point in points]
+        own = [point.own_m2 + self.bent_by_m**2 / 3 * np.eye(3) for point in points]
         return np.asarray(block_diag(*own) + self.of_place(points))
 
 
@@ -75,9 +75,9 @@ def diagnose_points(
     tested = [of for of, seen in zip(points.points, is_seen, strict=True) if seen and of.kind in (CONTROL, CHECK)]
     if not tested:
         return MistakeTests()
-    finder = MapPoints(model, {}, points.markers, np.nan)
-    found = [finder.find_marker(of.name) for of in tested]
-    of_map = placed.joint(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
+    named = NamedPoints.in_model(model, points.markers)
+    found = [named.find_mark(of.name) for of in tested]
+    of_map = placed.joint(found) if errors is None else errors.joint(found, scale_stddev)
     if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last
         of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)

@@ -16,7 +16,7 @@ from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, misfits
@@ -83,7 +83,8 @@ def refine_with_ranges(
     if shared_errors_m is not None:
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
     markers = tape.control().end_markers
-    at = MapToFit.of_model(metric, trajectory, options, markers, ranges.placed_anchors)
+    points = NamedPoints.in_model(metric, markers, ranges.placed_anchors, trajectory.frame_ids)
+    at = MapToFit(points, trajectory, options)
     upward = () if first_pose_is_fixed or gravity is None else (UpwardDirection(gravity),)
     with at_most(num_threads):
         problem = map_problem(

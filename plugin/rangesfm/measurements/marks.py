@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.lengths.markers import images_by_name, mark_covariance, triangulate_marker
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.points import NamedPoints, images_by_name
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 
 
@@ -18,10 +17,10 @@ def add_marks(model: pycolmap.Reconstruction, markers: Mapping[str, Marker]) -> 
     """Add markers to the model as 3-D points, with their marks as features; return the points' ids by name.
 
     Raises:
-        InputError: as in ``locate_distances``.
+        InputError: as of ``NamedPoints.find_mark``.
     """
-    images = images_by_name(model)
-    places = {name: triangulate_marker(name, marker, images) for name, marker in markers.items()}
+    images, points = images_by_name(model), NamedPoints.in_model(model, markers)
+    places = {name: points.find_mark(name).position_m for name in markers}
     ids = {}
     for name, place in places.items():
         marker = markers[name]
@@ -56,9 +55,8 @@ def errors_beyond_features(
     Args:
         markers: by name. marker_ids: 3-D points of the model, by name.
     """
-    images, found = images_by_name(bundle.metric), {}
+    points, found = NamedPoints.in_model(bundle.metric, markers), {}
     for name, point_id in marker_ids.items():
         beyond_px = float(np.sqrt(max(markers[name].stddev_px ** 2 - bundle.pixel_stddev**2, 0.0)))
-        point = np.array(bundle.metric.point3D(point_id).xyz)
-        found[name] = mark_covariance(replace(markers[name], stddev_px=beyond_px), point, images)
+        found[name] = points.point_of_model(point_id, beyond_px).own_m2
     return found

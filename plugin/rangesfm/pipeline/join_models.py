@@ -16,8 +16,7 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.transform import joined_model, rescale
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.model_placement import ScaledModel, place_models
-from rangesfm.measurements.lengths.locate_lengths import distances_within
-from rangesfm.measurements.lengths.markers import locatable
+from rangesfm.measurements.lengths.locate_lengths import distances_within, locatable
 from rangesfm.measurements.ranges.range_observations import each_on_one_path, joined_observations
 from rangesfm.pipeline.close_loops import loop_matching
 from rangesfm.pipeline.metric_result import ModelVerdict

@@ -11,10 +11,10 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
-from rangesfm.measurements.lengths.map_points import MapPoint, MapPoints
 from rangesfm.measurements.lengths.measured_lists import PAIRS
 from rangesfm.measurements.lengths.tape import FOUND_STDDEV_PX, Marker
 from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_markers
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
@@ -122,7 +122,7 @@ def measure(
 
 
 def measured(
-    points: MapPoints,
+    points: NamedPoints,
     pairs: Iterable[tuple[str, str]],
     errors: MapErrors | None,
     relative_scale_stddev: float,
@@ -141,13 +141,14 @@ def measured(
     pairs = list(pairs)
     found = {name: points.find(name) for name in dict.fromkeys(name for pair in pairs for name in pair)}
 
-    def between(first: MapPoint, second: MapPoint) -> Measurement:
+    def between(ends: tuple[str, str]) -> Measurement:
+        first, second = (found[name] for name in ends)
         apart = second.position_m - first.position_m
         distance_m = float(np.linalg.norm(apart))
         if errors is None:
             covariance = relative_scale_stddev**2 * np.outer(apart, apart)
         else:
-            covariance = errors.relative(first.errors, second.errors, relative_scale_stddev)
+            covariance = errors.relative(first, second, relative_scale_stddev)
 
         def interval(value: float, along: Array, more_stddev: float = 0.0) -> Interval:
             half = NORMAL_95 * math.sqrt(max(float(along @ covariance @ along), 0.0) + more_stddev**2)
@@ -161,9 +162,9 @@ def measured(
             if errors is not None:
                 level_m = float(np.linalg.norm(apart - height * upward))
                 of_height = interval(height, upward, tilt_stddev * level_m)
-        return Measurement((first.name, second.name), distance_m, (max(low, 0.0), high), height, of_height)
+        return Measurement(ends, distance_m, (max(low, 0.0), high), height, of_height)
 
-    return tuple(between(found[first], found[second]) for first, second in pairs)
+    return tuple(map(between, pairs))
 
 
 def read_point_pairs(path: Path) -> list[tuple[str, str]]:
@@ -183,7 +184,7 @@ def read_point_pairs(path: Path) -> list[tuple[str, str]]:
     return pairs
 
 
-def _points_of(result: ResultFolder, more_markers: Mapping[str, Marker]) -> MapPoints:
+def _points_of(result: ResultFolder, more_markers: Mapping[str, Marker]) -> NamedPoints:
     """Return the points of a result: with corners of printed tags that it found, and markers that its survey gave."""
     model = result.read_metric_model()
     if model is None:
@@ -197,7 +198,8 @@ def _points_of(result: ResultFolder, more_markers: Mapping[str, Marker]) -> MapP
     markers = markers_of_photos({**found, **more_markers}, [image.name for image in model.images.values()])
     refine = result.summary.refine
     pixel_stddev = None if refine is None else refine.pixel_stddev
-    return MapPoints(model, result.anchor_positions_m, markers, np.nan if pixel_stddev is None else pixel_stddev)
+    pixel_stddev = np.nan if pixel_stddev is None else pixel_stddev
+    return NamedPoints.in_model(model, markers, result.anchor_positions_m, pixel_stddev=pixel_stddev)
 
 
 def _interval(ends: Interval, sign: str = "") -> str:

@@ -6,17 +6,16 @@ and Drift Mitigation", 2018, with other estimators where real radios need them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import pycolmap
 
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.measurements.imu.sensor import InertialSensor
-from rangesfm.measurements.lengths.markers import locatable
+from rangesfm.measurements.lengths.locate_lengths import locatable
 from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.positions.clock import find_antenna_offset
-from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.pipeline.close_loops import close_loops_of_models
 from rangesfm.pipeline.join_models import join_models, tie_by_photos
 from rangesfm.pipeline.make_metric_map import metric_map, with_likeliest_cause
@@ -44,7 +43,10 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
+
+_Sensor = TypeVar("_Sensor")
 
 
 @with_one_blas_thread
@@ -158,14 +160,7 @@ def map_in_metres(
     """
     with run.journal.stage("scale"):
         path, verdicts = join_models(run, paths, must_join=must_join)
-        images = run.survey.images
-        baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
-        tape = run.inputs.tape.with_more(baselines)
-        positions = _positions_on_path(run, path)
-        run.journal.warn(*positions.notes_on(path.sfm))
-        tape_in_map = locatable(tape, path.sfm) if tape.distances else Tape()
-        run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
-        run = replace(run, inputs=replace(run.inputs, imu=_imu_on_path(run, path)))
+        run = _in_map(_with_clocks(run, path.trajectory), path.sfm)
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:
@@ -173,46 +168,52 @@ def map_in_metres(
     return made.in_given_coordinates()
 
 
-def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:
-    """Return the known positions with the time offset of the antenna's, which are left out if nothing tells it.
-
-    Raises:
-        InputError: the photos have no times. GeometryError: nothing tells the offset, and nothing else is measured.
-    """
-    positions = run.inputs.positions
-    if positions.antenna is None:
-        return positions
-    try:
-        return replace(positions, antenna=find_antenna_offset(positions.antenna, path.trajectory))
-    except GeometryError as error:
-        if not len(run.inputs.log) and not positions.points.points:
-            raise
-        run.journal.warn(f"the positions of the antenna are not used: {error}")
-        return replace(positions, antenna=None)
-
-
-def _imu_on_path(run: SurveyRun, path: PathOfModel) -> InertialSensor | None:
-    """Return the inertial sensor aligned with the photos, after warnings; it is left out if these do not tell how.
-
-    Raises:
-        InputError: the photos have no times, or were not taken while the sensor was recorded. GeometryError: the turns
-            do not tell how the sensor sits, and nothing else is measured.
-    """
-    if run.inputs.imu is None:
-        return None
-    try:
-        aligned = run.inputs.imu.aligned_with(path.trajectory)
-    except GeometryError as error:
-        if {*run.survey.metric_keys} <= {"imu.path"}:
-            raise
-        run.journal.warn(f"the inertial sensor is not used: {error}")
-        return None
-    if (found := aligned.alignment) is not None:
+def _with_clocks(run: SurveyRun, path: Trajectory) -> SurveyRun:
+    """Return the survey with the clocks of its sensors, as found on a path; errors are those of ``_or_left_out``."""
+    positions, imu = run.inputs.positions, run.inputs.imu
+    timed, without = partial(positions.timed_on, path), replace(positions, antenna=None)
+    positions = _or_left_out(run, "positions.path", "positions of the antenna are", timed, without)
+    if imu is not None:
+        imu = _or_left_out(run, "imu.path", "inertial sensor is", partial(imu.aligned_with, path), None)
+    if imu is not None and (found := imu.alignment) is not None:
         run.journal.warn(*found.mistakes)
         half_s = NORMAL_95 * found.time_offset_stddev_s
         offset = f"{found.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
         run.journal.note(f"time offset of the inertial sensor: {offset}, by {found.num_turns} turns of the photos")
-    return aligned
+    return replace(run, inputs=replace(run.inputs, positions=positions, imu=imu))
+
+
+def _or_left_out(run: SurveyRun, key: str, what: str, find: Callable[[], _Sensor], without: _Sensor) -> _Sensor:
+    """Return a sensor with its clock, or without it after a warning if nothing tells the clock.
+
+    Args:
+        key: of the file that it is read from. what: words for it. find: returns it with its clock.
+
+    Raises:
+        GeometryError: nothing tells the clock, and nothing else is measured. InputError: as of ``find``.
+    """
+    try:
+        return find()
+    except GeometryError as error:
+        if {*run.survey.metric_keys} <= {key}:
+            raise
+        run.journal.warn(f"the {what} not used: {error}")
+        return without
+
+
+def _in_map(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyRun:
+    """Return the survey with the lengths that are in a model, those of its rigs among them, after warnings."""
+    images, tape = run.survey.images, run.inputs.tape
+    tape = tape.with_more(read_rigs(images.rig_config).baselines(sfm, images.baseline_stddev_m))
+    run.journal.warn(*run.inputs.positions.notes_on(sfm))
+    in_map = locatable(tape, sfm) if tape.distances else Tape()
+    if lost := [taped for taped in tape.distances if taped not in in_map.distances and not taped.is_printed]:
+        run.journal.warn(
+            f"{len(lost)} of {len(tape.distances)} measured lengths are left out, as marks of their ends do not meet "
+            f"(by drift of the poses, or as they are of several points): "
+            f"{', '.join(' to '.join(taped.ends) for taped in lost)}"
+        )
+    return replace(run, inputs=replace(run.inputs, tape=in_map))
 
 
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:

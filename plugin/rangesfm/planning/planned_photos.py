@@ -16,10 +16,10 @@ import pycolmap
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.errors import GeometryError, InputError
+from rangesfm.errors import GeometryError
 from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information
-from rangesfm.measurements.lengths.markers import images_by_name, triangulate_marker
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, locate_points
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.option_model import Key, Options
@@ -122,6 +122,11 @@ class PlannedPhotos(Options, table="photos"):
         model, markers = pycolmap.Reconstruction(), dict[str, Marker]()
         model.add_camera_with_trivial_rig(camera)
         numbered = replace(path, frame_ids=np.arange(1, len(path) + 1))
+        for photo, name in enumerate(path.image_names):
+            rotation = path.world_from_cam[photo].T
+            cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ path.centers[photo])
+            image = pycolmap.Image(name=name, camera_id=1, image_id=photo + 1)
+            model.add_image_with_trivial_frame(image, cam_from_world)
         for point in points:
             in_cam = np.einsum("nji,nj->ni", path.world_from_cam, point.position_m - path.centers)
             shown = np.flatnonzero(self._shows(in_cam))
@@ -130,14 +135,9 @@ class PlannedPhotos(Options, table="photos"):
             pixels = np.array([camera.img_from_cam(in_cam[photo]) for photo in photos.tolist()]).reshape(-1, 2)
             names = tuple(path.image_names[photo] for photo in photos.tolist())
             markers[point.name] = Marker(names, pixels, (0,) * max(len(photos), 1))
-            for photo in photos.tolist():
-                if not model.exists_image(photo + 1):
-                    image = pycolmap.Image(name=path.image_names[photo], camera_id=1, image_id=photo + 1)
-                    rotation = path.world_from_cam[photo].T
-                    cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ path.centers[photo])
-                    model.add_image_with_trivial_frame(image, cam_from_world)
-        found = tuple(point for point in points if _is_found(point.name, markers[point.name], model))
-        return locate_points(ControlPoints(found, markers), model, numbered)
+        found = NamedPoints.in_model(model, markers)
+        shown_points = tuple(point for point in points if found.is_determined(point.name))
+        return locate_points(ControlPoints(shown_points, markers), model, numbered)
 
     def aside(self, path: Trajectory, photos: Indices) -> Array:
         """Return points (2 k, 3) at a middle distance, half-way to the left and right edge of each of k photos.
@@ -200,14 +200,6 @@ class PlannedPhotos(Options, table="photos"):
             points,
             np.arange(len(points)),
         )
-
-
-def _is_found(name: str, marker: Marker, model: pycolmap.Reconstruction) -> bool:
-    try:
-        triangulate_marker(name, marker, images_by_name(model))
-    except InputError:
-        return False
-    return True
 
 
 def _in_runs(found: npt.NDArray[np.bool_], longest: int) -> npt.NDArray[np.bool_]:

@@ -21,11 +21,10 @@ from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_betw
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
 from rangesfm.measurements.lengths.locate_lengths import (
     NO_DISTANCES,
-    lengths_by_pose,
     locate_distances,
     surveyed_distances,
 )
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
@@ -107,8 +106,7 @@ def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array])
 def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
     if not inputs.tape.distances:
         return None
-    found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
-    found = replace(found, by_pose=lengths_by_pose(found, inputs.tape, at.model, at.path))
+    found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path.frame_ids)
     if (before := find_kind(at.before, LengthScale)) is not None:
         return before.on_refined_map(found, at.path, at.bending, at.metres_per_unit)
     return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, inputs.tape.distances)
@@ -180,7 +178,8 @@ def measured_in_map(
         tape = tape.with_more(surveyed_distances(inputs.anchors))
     ranges, options = ranges_in_map(inputs, estimate, path, survey.refine), survey.refine
     markers = tape.end_markers | {name: of for kind in on_map.kinds for name, of in kind.markers.items()}
-    at = MapToFit.of_model(model, path, options, markers, ranges.placed_anchors)
+    points = NamedPoints.in_model(model, markers, ranges.placed_anchors, path.frame_ids)
+    at = MapToFit(points, path, options)
     of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, at))
     upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
     levelled = () if upward is None else (UpwardDirection(upward),)

@@ -24,7 +24,7 @@ from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, SensorPrior
 from rangesfm.measurements.kind import Measurements
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.poses import Poses
@@ -60,9 +60,10 @@ def drift(made: SyntheticModel) -> tuple[Poses, Poses]:
 def refined(
     metric: pycolmap.Reconstruction, path: Trajectory, measured: Callable[[MapToFit], Measurements]
 ) -> MapAtRest:
+    points = NamedPoints.in_model(metric, {}, first_ids=path.frame_ids)
     problem = map_problem(
         metric,
-        (measured(MapToFit.of_model(metric, path, RefineOptions(), {}, ())),),
+        (measured(MapToFit(points, path, RefineOptions())),),
         path,
         camera=CameraOptions(refine_intrinsics=False),
         options=RefineOptions(),

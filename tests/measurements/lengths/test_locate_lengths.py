@@ -12,8 +12,9 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.errors import InputError
-from rangesfm.measurements.lengths.locate_lengths import locate_distances
+from rangesfm.measurements.lengths.locate_lengths import locatable, locate_distances
 from rangesfm.measurements.lengths.tape import Marker, Tape, TapedDistance
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.pipeline.result_records import disagreements
 from rangesfm.result.entries import DistanceRow
 
@@ -48,8 +49,9 @@ def tape(*distances: TapedDistance, **markers: Marker) -> Tape:
 
 
 def test_two_photos_are_as_far_apart_as_their_cameras(made: SyntheticModel) -> None:
-    names = list(made.timestamps_s)
-    located = locate_distances(tape(taped(names[2], names[7])), made.reconstruction, [])
+    names, door = list(made.timestamps_s), marker_of(made.reconstruction, long_tracks(made.reconstruction, 1)[0])
+    of_one_name = tape(taped(names[2], names[7]), **{names[2]: door})  # the photo is meant
+    located = locate_distances(of_one_name, made.reconstruction, [])
     lengths = located.lengths_m(made.metric_from_sfm.scale, np.zeros((0, 3)))
     assert lengths == pytest.approx([np.linalg.norm(made.centers_m[2] - made.centers_m[7])], rel=1e-9)
 
@@ -88,6 +90,22 @@ def test_ends_that_are_nowhere_are_refused(made: SyntheticModel) -> None:
     for said, (given, anchor_ids) in cases.items():
         with pytest.raises(InputError, match=said):
             locate_distances(given, model, anchor_ids)
+
+
+def test_marks_that_do_not_meet_are_left_out_of_poses_that_drift(made: SyntheticModel) -> None:
+    """In a map with points, which the photos hold together, they are a mistake of the user."""
+    with_points, name = made.reconstruction, next(iter(made.timestamps_s))
+    poses = pycolmap.Reconstruction(with_points)
+    for point_id in list(poses.point3D_ids()):
+        poses.delete_point3D(point_id)
+    wall, door = (marker_of(with_points, point) for point in long_tracks(with_points, 2))
+    astray = replace(door, pixels=door.pixels + np.eye(len(door.pixels), 2) * 300)
+    given = tape(taped(name, "wall"), taped(name, "door"), wall=wall, door=astray)
+    assert locatable(given, with_points).distances == given.distances
+    assert locatable(given, poses).distances == given.distances[:1]
+    known = tuple(ControlPoint(marker, np.zeros(3), 0.01, "control", 2) for marker in ("wall", "door"))
+    assert marks_seen(ControlPoints(known, given.markers), with_points).tolist() == [True, True]
+    assert marks_seen(ControlPoints(known, given.markers), poses).tolist() == [True, False]
 
 
 def test_a_distance_off_by_more_than_tape_and_scale_explain_is_named() -> None:

@@ -267,7 +267,7 @@ def motions_on_map(
         start,
         RobustLoss(at.options.range_loss_scale, is_bounded=True),
     )
-    return motions.with_noise_of(motions.linearize(MapState(at.poses, start)).residual, 0.0)
+    return motions.with_noise_of(motions.linearize(MapState(at.points.state.poses, start)).residual, 0.0)
 
 
 def velocity_block(photo: int) -> Block:

@@ -20,9 +20,8 @@ from rangesfm.measurements.kind import (
     Measurements,
     Weights,
 )
-from rangesfm.measurements.lengths.markers import images_by_name, variance_along
 from rangesfm.measurements.lengths.tape import Marker, Tape
-from rangesfm.measurements.points import MapToFit, NamedPoints, linearized
+from rangesfm.measurements.points import MapToFit, NamedPoints, images_by_name, variance_along
 from rangesfm.measurements.prior import Prior
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss
@@ -60,7 +59,7 @@ class Lengths(Measurements):
 
     @property
     def markers(self) -> Mapping[str, Marker]:
-        return {name: self.points.markers[name] for of in self.ends for name in of if name in self.points.markers}
+        return self.points.marked(name for of in self.ends for name in of)
 
     @property
     def blocks(self) -> Mapping[Block, Array]:
@@ -90,7 +89,7 @@ class Lengths(Measurements):
             along = apart[None] / max(distance_m, _TINY_M)
             residuals.append(np.array([distance_m + bias_m - length_m]))
             slopes.append([(-along, start), (along, end)])
-        found = linearized(residuals, slopes)
+        found = self.points.linearized(state, residuals, slopes)
         if not self.bias_stddev_m > 0:
             return found
         num = len(residuals)
@@ -122,7 +121,7 @@ class Lengths(Measurements):
 
     def _is_in_rig(self, names: tuple[str, str]) -> bool:
         """Return whether both ends are cameras of one rig at one time, whose length is that of the rig."""
-        frames = [self.points.cameras[name][0] for name in names if name in self.points.cameras]
+        frames = [self.points.views[name].keyframe for name in names if name in self.points.views]
         return len(frames) == 2 and frames[0] == frames[1]
 
     def _of_world(

@@ -14,17 +14,16 @@ from scipy.sparse import csr_array, vstack
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
-from rangesfm.measurements.lengths.map_points import MapPoints, by_pose
-from rangesfm.measurements.lengths.markers import images_by_name, mark_covariance, triangulate_markers, variance_along
 from rangesfm.measurements.lengths.tape import CONTROL, Tape, TapedDistance
+from rangesfm.measurements.points import NamedPoints, images_by_name, variance_along
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.util.geometry.trajectory import Trajectory
 
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
 _MIN_STDDEV_M = 1e-3
 # Names of printed tags' corners, as ``find_tags`` gives them.
 _TAG = re.compile(r"tag\d+\.[0-3]")
+_NO_FRAMES: Indices = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -131,30 +130,36 @@ class LocatedDistances:
 NO_DISTANCES = LocatedDistances.between_points(*np.zeros((3, 0)))
 
 
-def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:
-    """Find the ends of measured lengths in a model, without derivatives by its poses.
+def locate_distances(
+    tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str], frame_ids: Indices = _NO_FRAMES
+) -> LocatedDistances:
+    """Find the ends of measured lengths in a model.
 
     An end is the photo of that name (its projection centre), else the marker, else the anchor.
+
+    Args:
+        frame_ids: (n,) of a path, by whose poses the derivatives are.
 
     Raises:
         InputError: an end is none of these, a photo is not in the model, only one of the two ends is an anchor, or the
             marks of a marker are too few, seen from one direction only, or not of one point. The error gives the line.
     """
-    images, markers = images_by_name(model), triangulate_markers(tape, model)
-    points = {name: image.projection_center() for name, image in images.items()} | markers
-    ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
-    pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
+    points, num = NamedPoints.in_model(model, tape.markers, first_ids=frame_ids), len(tape.distances)
+    ends, mark_stddev, by_pose = np.full((num, 2, 3), np.nan), np.zeros(num), np.zeros((num, 6 * len(frame_ids)))
+    pairs = np.full((num, 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
-        start, end = taped.ends
-        if start in points and end in points:
-            ends[row] = points[start], points[end]
-            marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
-            of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
-            mark_stddev[row] = np.sqrt(variance_along(ends[row, 0], ends[row, 1], sum(of_ends, np.zeros((3, 3)))))
-        elif start in anchor_ids and end in anchor_ids:
-            pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
+        if all(name in points for name in taped.ends):
+            start, end = (points.find(name) for name in taped.ends)
+            ends[row] = start.position_m, end.position_m
+            mark_stddev[row] = np.sqrt(variance_along(start.position_m, end.position_m, start.own_m2 + end.own_m2))
+            if not taped.is_everywhere:
+                along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
+                by_pose[row] = along @ (points.by_pose(end, len(frame_ids)) - points.by_pose(start, len(frame_ids)))
+        elif set(anchor_ids).issuperset(taped.ends):
+            pairs[row] = [anchor_ids.index(name) for name in taped.ends]
         else:
-            raise InputError(_what_is_wrong(taped, points, anchor_ids), tape.distances_path, taped.line)
+            known = [*points.views, *points.markers]
+            raise InputError(_what_is_wrong(taped, known, anchor_ids), tape.distances_path, taped.line)
     return LocatedDistances(
         np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
         pairs,
@@ -165,21 +170,8 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
         np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
-        csr_array((len(tape.distances), 0)),
+        csr_array(by_pose),
     )
-
-
-def lengths_by_pose(
-    located: LocatedDistances, tape: Tape, model: pycolmap.Reconstruction, path: Trajectory
-) -> csr_array:
-    """Return the derivatives of the model's lengths, as of ``LocatedDistances``, by the poses of its path."""
-    finder, slopes = MapPoints(model, {}, tape.markers, np.nan), np.zeros((len(located), 6 * len(path)))
-    for row in np.flatnonzero(located.is_between_points & ~located.is_everywhere).tolist():
-        names = tape.distances[row].ends
-        start, end = (finder.find_marker(name) if name in tape.markers else finder.find(name) for name in names)
-        away = located.ends[row, 1] - located.ends[row, 0]
-        slopes[row] = away / max(float(np.linalg.norm(away)), 1e-12) @ (by_pose(end, path) - by_pose(start, path))
-    return csr_array(slopes)
 
 
 def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str], *, may_be_tags: bool) -> None:
@@ -202,6 +194,17 @@ def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str],
             if (num := len({*marker.image_names} & {*photos})) < 2:
                 message = f"marker {end!r} is marked in {num} photos of the survey, expected two or more"
                 raise InputError(message, marker.path, marker.lines[0])
+
+
+def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
+    """Return the tape without lengths to corners of printed tags which cannot be triangulated.
+
+    Markers set by hand are kept, so that the user is told what is wrong with them, unless the map is one of poses, in
+    which drift may be wrong.
+    """
+    points = NamedPoints.in_model(model, tape.end_markers if not model.num_points3D() else tape.found_markers)
+    lost = {name for name in points.markers if name not in points.views and not points.is_determined(name)}
+    return replace(tape, distances=tuple(taped for taped in tape.distances if lost.isdisjoint(taped.ends)))
 
 
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:

@@ -11,9 +11,8 @@ import pycolmap
 from scipy.sparse import csr_array, vstack
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.measurements.lengths.map_points import MapPoints, by_pose
-from rangesfm.measurements.lengths.markers import images_by_name
 from rangesfm.measurements.lengths.tape import CONTROL, Marker
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -78,14 +77,13 @@ class ControlPoints:
 
 
 def marks_seen(points: ControlPoints, model: pycolmap.Reconstruction) -> Mask:
-    """Return which points (k,) are marked in two photos of a model or more."""
-    images = images_by_name(model)
-    photos = (points.markers[point.name].image_names if point.name in points.markers else () for point in points.points)
-    return np.array([sum(photo in images for photo in of_point) >= 2 for of_point in photos], dtype=bool)
+    """Return which points (k,) are shown by their marks, as of ``NamedPoints.is_shown``."""
+    named = NamedPoints.in_model(model, points.markers)
+    return np.array([named.is_shown(point.name) for point in points.points], dtype=bool)
 
 
 def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
-    """Find the marks of control and check points in a model; points that fewer than two photos show are left out.
+    """Find the marks of control and check points in a model; points that are not shown are left out.
 
     Args:
         points: in the site. model: in any world. path: of its keyframes, in the same world.
@@ -94,8 +92,9 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         InputError: the marks of a point are not of one point, or are seen from one direction only.
     """
     seen = [point for point, is_seen in zip(points.points, marks_seen(points, model), strict=True) if is_seen]
-    finder, k = MapPoints(model, {}, points.markers, np.nan), len(seen)
-    found = [finder.find_marker(point.name) for point in seen]
+    named, k = NamedPoints.in_model(model, points.markers, first_ids=path.frame_ids), len(seen)
+    found = [named.find_mark(point.name) for point in seen]
+    by_pose = [named.by_pose(each, len(path)) for each in found]
     stddev_m = np.array([point.stddev_m for point in seen])
     return KnownPositions(
         names=tuple(point.name for point in seen),
@@ -107,13 +106,13 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         is_geodetic=np.full(k, bool(points.crs)),
         places=np.array([each.position_m for each in found]).reshape(-1, 3),
         arms_m=np.zeros((k, 3)),
-        own_covariance=np.array([each.errors.own_m2 for each in found]).reshape(-1, 3, 3),
+        own_covariance=np.array([each.own_m2 for each in found]).reshape(-1, 3, 3),
         arm_stddev_m=np.zeros(k),
         time_s=np.full(k, np.nan),
         clock_stddev_s=np.zeros(k),
         velocity=np.zeros((k, 3)),
         world_from_cam=np.zeros((k, 3, 3)),
-        by_pose=vstack([csr_array((0, 6 * len(path))), *(by_pose(each, path) for each in found)], format="csr"),
+        by_pose=vstack([csr_array((0, 6 * len(path))), *by_pose], format="csr"),
         arms_by_pose=csr_array((3 * k, 6 * len(path))),
         on_path=np.full((k, 2), -1, dtype=np.int64),
         fraction=np.zeros(k),

@@ -21,7 +21,7 @@ from rangesfm.measurements.kind import (
 )
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
-from rangesfm.measurements.points import MapToFit, NamedPoints, linearized
+from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.prior import Prior
@@ -235,9 +235,9 @@ class MarkedPositions(Measurements):
         return Weights(roots, np.ones(len(self.names)), LEAST_SQUARES)
 
     def linearize(self, state: MapState) -> Linearization:
-        placed = [self.points.at(name, state) for name in self.names]
+        placed = [self.points.mark_at(name, state) for name in self.names]
         residuals = [point.position_m - at for point, at in zip(placed, self.position_m, strict=True)]
-        return linearized(residuals, [[(np.eye(3), point)] for point in placed])
+        return self.points.linearized(state, residuals, [[(np.eye(3), point)] for point in placed])
 
     def with_errors_of_marks(self, beyond_m2: Mapping[str, Array]) -> Self:
         return replace(self, beyond_m2=beyond_m2)

@@ -11,9 +11,12 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
+from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.control_points import ControlPoints, locate_points, marks_seen
 from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
+
+_OR_DRIFT = ", or these do not meet (by drift of the poses, or as they are of several points)"
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,10 @@ class SurveyedPositions:
             return marks
         return marks.joined(locate_antenna(self.antenna, path))
 
+    def timed_on(self, path: Trajectory) -> SurveyedPositions:
+        """Return the positions with the time offset of the antenna's; errors are those of ``find_antenna_offset``."""
+        return self if self.antenna is None else replace(self, antenna=find_antenna_offset(self.antenna, path))
+
     def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
         """Return the positions with more marks in photos."""
         return replace(self, points=self.points.with_more(markers))
@@ -107,7 +114,7 @@ class SurveyedPositions:
             )
             yield (
                 f"{len(unseen)} of {len(points)} known points are left out, as fewer than two photos of the map have "
-                f"marks of them: {', '.join(unseen)}{marked}"
+                f"marks of them{_OR_DRIFT * (not model.num_points3D())}: {', '.join(unseen)}{marked}"
             )
 
     def moved(self, offset_m: Array) -> SurveyedPositions:

@@ -67,9 +67,9 @@ class Ranges(Measurements):
         return any(np.isfinite(each.prior_position_stddev_m) for each in self.anchors)
 
     @property
-    def placed_anchors(self) -> tuple[str, ...]:
-        """Names of the anchors with a position."""
-        return tuple(each.anchor_id for each in self.anchors if np.isfinite(each.position_m).all())
+    def placed_anchors(self) -> Mapping[str, Array]:
+        """(3,) positions of the anchors that have one, by name."""
+        return {each.anchor_id: each.position_m for each in self.anchors if np.isfinite(each.position_m).all()}
 
     @property
     def is_heard(self) -> npt.NDArray[np.bool_]:

@@ -53,7 +53,7 @@ def ranges_of_map(
 def measured_by_radio(ranges: Ranges, at: MapToFit) -> Iterator[Measurements]:
     """Yield the ranges of a log to anchors on a metric map, and the lengths between anchors, if there are any."""
     if len(ranges.rows):
-        ranges = ranges.begun(MapState(at.poses, ranges.blocks))
+        ranges = ranges.begun(MapState(at.points.state.poses, ranges.blocks))
         yield ranges
     if len((by_radio := _between_anchors(ranges, at.points)).ends):
         yield by_radio
@@ -70,7 +70,7 @@ def _between_anchors(ranges: Ranges, points: NamedPoints) -> Lengths:
         common_bias_stddev_m=0.0,
     )
     ends = [tuple(anchors[k].anchor_id for k in pair) for pair in found.anchor_pair.tolist()]
-    rows = [row for row, pair in enumerate(ends) if points.anchors.issuperset(pair)]
+    rows = [row for row, pair in enumerate(ends) if all(("anchor", name) in points.state.blocks for name in pair)]
     return Lengths(
         tuple((ends[row][0], ends[row][1]) for row in rows),
         points,

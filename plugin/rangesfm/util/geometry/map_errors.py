@@ -12,9 +12,11 @@ from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array, Indices
 
-Kind = Literal["frame", "camera", "sensor", "anchor"]
+Kind = Literal["frame", "camera", "sensor", "anchor", "mark"]
 Part = tuple[Kind, int | str]
-"""A part of a map: its kind, and its COLMAP id or the id of the anchor. A sensor has the id of its camera."""
+"""A part of a map: its kind, and its COLMAP id or the name of the anchor or mark. A sensor has the id of its camera.
+
+Marks are parts only in a fit of which they are parameters."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,16 @@ class PartErrors:
 
 
 @dataclass(frozen=True)
-class MapPointErrors:
-    """Errors of one point of a map.
+class MapPoint:
+    """A point of a map, and how it errs.
 
     Attributes:
+        position_m: (3,) in the world of the map.
         by_part: (3, d) change of the point, in metres, by each part that it depends on.
         own_m2: (3, 3) covariance of the error that only this point has.
     """
 
+    position_m: Array
     by_part: Mapping[Part, Array]
     own_m2: Array
 
@@ -83,7 +87,7 @@ class MapErrors:
         rows = [self.parts["frame"].row_of[frame_id] for frame_id in frame_ids.tolist()]
         return np.asarray(self.covariances("frame")[rows, 3:, 3:])
 
-    def relative(self, first: MapPointErrors, second: MapPointErrors, scale_stddev: float) -> Array:
+    def relative(self, first: MapPoint, second: MapPoint, scale_stddev: float) -> Array:
         """Return how a point errs relative to another one.
 
         Args:
@@ -96,7 +100,7 @@ class MapErrors:
         apart = np.hstack([-np.eye(3), np.eye(3)])
         return np.asarray(apart @ self.joint([first, second], scale_stddev) @ apart.T)
 
-    def joint(self, points: Sequence[MapPointErrors], scale_stddev: float) -> Array:
+    def joint(self, points: Sequence[MapPoint], scale_stddev: float) -> Array:
         """Return how k points err together in the world; arguments and values as for ``relative``.
 
         Returns:
