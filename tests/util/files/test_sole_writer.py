@@ -19,7 +19,7 @@ from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.util.files.atomic import new_file, new_folder, sole_writer, write_text
+from rangesfm.util.files.atomic import new_file, new_folder, sole_writer
 from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 if TYPE_CHECKING:
@@ -133,11 +133,12 @@ def test_a_thread_keeps_others_out_but_not_itself(tmp_path: Path) -> None:
         assert (tmp_path / LOCK_NAME).exists()
 
 
-def test_where_there_are_no_locks_it_goes_on_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(95, "Operation not supported")
+def no_locks(*_: object) -> None:
+    raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr("fcntl.flock", fail)
+
+def test_where_there_are_no_locks_it_goes_on_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fcntl.flock", no_locks)
     with sole_writer(tmp_path), sole_writer(tmp_path):
         assert names_in(tmp_path) == []
     assert os.listdir(tmp_path) == []
@@ -187,16 +188,17 @@ def test_what_a_killed_process_had_in_the_making_is_cleared_away(tmp_path: Path)
     assert {path.name for path in tmp_path.rglob("*")} == {"models", ".mine.part"}
 
 
-def test_what_a_living_process_has_in_the_making_stays(tmp_path: Path) -> None:
+def test_where_there_are_no_locks_what_another_process_has_in_the_making_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fcntl.flock", no_locks)
     with sole_writer(tmp_path) as output:
-        token = output.part("x").name.partition("-")[0]
-        write_text("", tmp_path / "file")
-        alive = output.private / "parts" / f"{token}-{os.getppid()}-0-points.ply"
-        dead, another = (alive.with_name(name) for name in (f"{token}-{2**31}-0-points.ply", "abc-123-0-points.ply"))
-        for path in (alive, dead, another):
-            path.touch()
+        own = output.part("x")
+        other = own.with_name(f"{os.getppid()}-0-points.ply")
+        own.touch()
+        other.touch()
     with sole_writer(tmp_path):
-        assert {path.name for path in alive.parent.iterdir()} == {alive.name, another.name}
+        assert list(own.parent.iterdir()) == [other]
 
 
 def test_what_is_made_inside_is_not_cleared_away(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -24,7 +23,6 @@ class Manifest:
     no longer does.
 
     Attributes:
-        token: a random word in the names of unfinished files, so that no other file can have such a name.
         moves: renames that were begun and not finished: source in the private folder, target in the folder.
     """
 
@@ -36,16 +34,11 @@ class Manifest:
         """
         self._folder = folder
         self._path = private / _NAME
-        self.token = secrets.token_hex(4)
         self.moves: list[tuple[str, str]] = []
         self._hashes: dict[str, list[str]] = {}
         self._states: dict[str, State] = {}
         if os.path.lexists(self._path):
             self._read()
-
-    @property
-    def is_empty(self) -> bool:
-        return not self._hashes and not self.moves
 
     def foreign_file(self, path: Path) -> Path | None:
         """Return a file at ``path`` or inside it that is not this tool's own, or None if there is none."""
@@ -79,11 +72,14 @@ class Manifest:
                     self._states.pop(name, None)
 
     def save(self) -> None:
-        """Write the record, complete or not at all."""
+        """Write the record, complete or not at all; without anything to record there is none."""
+        if not self._hashes and not self.moves:
+            self._path.unlink(missing_ok=True)
+            return
         files = {
             name: {"sha256": hashes, "state": self._states.get(name)} for name, hashes in sorted(self._hashes.items())
         }
-        record = {"version": _VERSION, "token": self.token, "moves": self.moves, "files": files}
+        record = {"version": _VERSION, "moves": self.moves, "files": files}
         temporary = self._path.with_name(f"{_NAME}.{os.getpid()}")
         try:
             temporary.write_text(json.dumps(record, indent=1), encoding="utf-8", errors="surrogateescape")
@@ -91,18 +87,12 @@ class Manifest:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def remove(self) -> None:
-        self._path.unlink(missing_ok=True)
-
     def _read(self) -> None:
         try:
             with open_regular(self._path) as file:
                 record = json.loads(file.read().decode("utf-8", errors="surrogateescape"))
             if record["version"] != _VERSION:
                 raise ValueError(f"version {record['version']}")
-            self.token = _text(record["token"])
-            if not self.token.isalnum():
-                raise ValueError(f"{self.token!r} is no token")
             self.moves = [(_text(source) and _name(source), _name(target)) for source, target in record["moves"]]
             for name, entry in record["files"].items():
                 self._hashes[_text(name)] = [_text(sha256) for sha256 in entry["sha256"]]

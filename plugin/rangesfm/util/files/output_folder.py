@@ -49,22 +49,26 @@ class OutputFolder:
         private: the hidden folder inside it, whose content is this tool's own.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, *, is_locked: bool):
+        """Finish what a killed process had begun to publish, and remove what it had in the making.
+
+        Args:
+            is_locked: whether other processes are kept out. Otherwise they may have something in the making, too.
+        """
         self.path = path
+        self._is_locked = is_locked
         self.private = path / PRIVATE_NAME
         self._manifest = Manifest(path, self.private)
         self._deferred: dict[Path, Path] = {}
         self._emptied: set[Path] = set()
-        self._clear_parts()
         self._finish_moves()
+        self.clear_parts()
 
     def part(self, name: str) -> Path:
         """Return a unique path for an unfinished file or folder, on the same file system."""
         folder = self.private / _PARTS_NAME
-        if not folder.exists():
-            self._manifest.save()  # the next process knows leftovers of this one by the manifest's token
-            folder.mkdir()
-        return folder / f"{self._manifest.token}-{os.getpid()}-{next(_numbers)}-{name}"
+        folder.mkdir(exist_ok=True)
+        return folder / f"{os.getpid()}-{next(_numbers)}-{name}"
 
     def require_own(self, targets: Iterable[Path]) -> None:
         """Check that everything at these paths, or inside them, was written by this tool and is unchanged.
@@ -141,14 +145,6 @@ class OutputFolder:
                 remove(folder)
             self._emptied = set()
 
-    def close(self) -> None:
-        """Remove unfinished files, and the record if it is empty and nothing else is in the private folder."""
-        self._clear_parts()
-        with suppress(OSError):
-            (self.private / _PARTS_NAME).rmdir()
-        if self._manifest.is_empty and not (set(os.listdir(self.private)) - {"lock", "manifest.json"}):
-            self._manifest.remove()
-
     def _move(self, moves: Iterable[tuple[Path | None, Path]], done: list[tuple[Path, Path]]) -> None:
         """Move each source to its target, after what is there has been moved away; ``done`` gets the renames."""
         for source, target in moves:
@@ -176,18 +172,15 @@ class OutputFolder:
         left = [(s, t) for s, t in moves if (t not in filled if s is None else os.path.lexists(s))]
         self._move(left, [])
         self._settle(target for _, target in moves)
-        self._clear_parts()
 
-    def _clear_parts(self) -> None:
-        """Remove unfinished files whose process has ended, except those that a begun move still needs."""
+    def clear_parts(self) -> None:
+        """Remove what is unfinished, and what was replaced."""
         folder = self.private / _PARTS_NAME
-        needed = [Path(source).parts for source, _ in self._manifest.moves]
-        kept = {parts[1] for parts in needed if parts[:1] == (_PARTS_NAME,) and len(parts) > 1}
         for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
-            token, pid = (*path.name.split("-", 2), "")[:2]
-            is_ours = token == self._manifest.token and pid.isdecimal() and path.name not in kept
-            if is_ours and not _is_another_process(int(pid)):
+            if self._is_locked or path.name.startswith(f"{os.getpid()}-"):
                 remove(path)
+        with suppress(OSError):
+            folder.rmdir()
 
 
 _held: ContextVar[Mapping[Path, OutputFolder]] = ContextVar("held", default=MappingProxyType({}))
@@ -218,13 +211,13 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
     try:
         _acquire(lock, folder, private, max_wait_s)
         is_held = True
-        held = OutputFolder(key)
+        held = OutputFolder(key, is_locked=lock.is_locked)
         token = _held.set(MappingProxyType({**_held.get(), key: held}))
         try:
             yield held
         finally:
             _held.reset(token)
-            held.close()
+            held.clear_parts()
     finally:
         if is_held or lock.is_locked:  # a Ctrl-C may come when the lock has just been acquired
             with suppress(OSError):  # Windows does not remove an open file
@@ -352,15 +345,3 @@ def _holder(lock: Path) -> str:
         return f"{who} has been writing to this folder since {since}"
     except (OSError, ValueError, TypeError, KeyError, RecursionError):  # the holder has not written its entry yet
         return "another process is writing to this folder"
-
-
-def _is_another_process(pid: int) -> bool:
-    """Return whether another living process has this number; leftovers with our own number are an earlier process's."""
-    import psutil
-
-    try:  # a process that has ended remains listed until its parent asks for its exit status
-        return pid != os.getpid() and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
-    except psutil.AccessDenied:
-        return True
-    except (psutil.NoSuchProcess, OverflowError):
-        return False
