@@ -75,25 +75,7 @@ def understand(
     values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
     found = look_into(folders, {path for path in values.values() if isinstance(path, Path)})
     _tell_points_from_anchors(found, values)
-    notes, questions = list(found.notes), []
-    for item in KEYS:
-        key, paths = item.dotted, found.paths.get(item.dotted, [])
-        if not paths:
-            continue
-        if key in values or (key == "scale.markers" and not {"scale.distances", POINTS} & values.keys()):
-            why = f"--{item.flag} names another" if key in values else "marks are ends of distances, or known points"
-            notes.append(f"not used: {', '.join(short_path(path, folders) for path in paths)} ({why})")
-            continue
-        paths = _tops(paths, folders) if key == PHOTOS else paths
-        chosen = _chosen(key, paths)
-        if chosen is None:
-            names = ", ".join(short_path(path, folders) for path in paths)
-            questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
-            continue
-        values[key] = chosen
-        if chosen in paths and len(paths) > 1:
-            others = ", ".join(short_path(path, folders) for path in paths if path != chosen)
-            notes.append(f"{chosen.name} is used; left out: {others}")
+    notes, questions = _choose_paths(values, found, folders)
     unclear = {key: those for key, those in found.unclear.items() if key not in values}
     questions += [line for key, those in unclear.items() for line in _questions(key, those, folders, command)]
     if questions:
@@ -127,6 +109,30 @@ def understand(
     _add_camera(values, found, notes)
     _add_exif_positions(values, notes)
     return values, notes
+
+
+def _choose_paths(values: dict[str, Any], found: Found, folders: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """Add one path for each key to ``values``; return notes on those left out, and questions where it is not clear."""
+    notes, questions = list(found.notes), []
+    for item in KEYS:
+        key, paths = item.dotted, found.paths.get(item.dotted, [])
+        if not paths:
+            continue
+        if key in values or (key == "scale.markers" and not {"scale.distances", POINTS} & values.keys()):
+            why = f"--{item.flag} names another" if key in values else "marks are ends of distances, or known points"
+            notes.append(f"not used: {', '.join(short_path(path, folders) for path in paths)} ({why})")
+            continue
+        paths = _tops(paths, folders) if key == PHOTOS else paths
+        chosen = _chosen(key, paths)
+        if chosen is None:
+            names = ", ".join(short_path(path, folders) for path in paths)
+            questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
+            continue
+        values[key] = chosen
+        if chosen in paths and len(paths) > 1:
+            others = ", ".join(short_path(path, folders) for path in paths if path != chosen)
+            notes.append(f"{chosen.name} is used; left out: {others}")
+    return notes, questions
 
 
 def _tell_points_from_anchors(found: Found, values: Mapping[str, Any]) -> None:
