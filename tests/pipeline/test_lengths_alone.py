@@ -14,8 +14,8 @@ import pytest
 from scipy.spatial.distance import pdist
 from tests.known import assert_scale, known
 from tests.outputs import paths_in
-from tests.rendering.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 from tests.simulated.model import SyntheticModel
+from tests.simulated.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
