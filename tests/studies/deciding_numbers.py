@@ -37,6 +37,7 @@ import numpy as np
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import Kind, simulated
 from tests.studies import drifting_maps, known_positions
+from tests.studies.kept_runs import KeptRuns
 from tests.studies.measured_distances import KINDS
 
 import rangesfm
@@ -195,7 +196,6 @@ def effect(
             each.stop()
     widths = [change["half_width"] for change in changes] or [1.0]
     return {
-        "number": list(number),
         "read_by": list(runs),
         "scale": max((change["scale"] for change in changes), default=0.0),
         "half_width": max(widths, key=lambda ratio: abs(np.log(ratio))),
@@ -213,21 +213,15 @@ def main() -> int:
     parser.add_argument("--rooms", nargs="*", default=list(ROOMS))
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
-    lines = [json.loads(line) for line in known]
-    done, runs = {tuple(line["number"]) for line in lines}, surveys()
+    kept, runs = KeptRuns(args.out, "number"), surveys()
     usual, read = {}, {}
     for name, run in runs.items():
         with Reads() as reads:
             usual[name] = run()
         read[name] = reads.read
-    for number in [number for number in numbers(tuple(args.rooms)) if number not in done]:
-        lines.append(effect(number, runs, usual, read))
-        print(json.dumps(lines[-1]), flush=True)
-        if args.out is not None:
-            with args.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(lines[-1]) + "\n")
-    lines.sort(key=size_of, reverse=True)
+    for number in numbers(tuple(args.rooms)):
+        print(json.dumps(kept.run(partial(effect, number, runs, usual, read), number=list(number))), flush=True)
+    lines = sorted(kept.rows, key=size_of, reverse=True)
     print("number, change of a scale (stddevs), of a half width (ratio), of a place (stddevs), verdicts")
     for line in (line for line in lines if size_of(line) > MOVES_NOTHING):
         name = ".".join(filter(None, line["number"]))

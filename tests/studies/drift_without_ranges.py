@@ -23,13 +23,10 @@ the share of keyframes within their 95 % ellipsoids, and the verdicts with their
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +36,7 @@ from tests.simulated.path import lap_path
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, Truth, expected_drift_m, made, truth_of
 from tests.studies.drifting_maps import ROUND_THE_FIELD_M
+from tests.studies.kept_runs import run_seeds, seeds_parser
 from tests.studies.known_positions import NO_RANGES, POINT_STDDEV_M, RECEIVERS, Receiver, rms
 from tests.studies.measured_distances import marks_in
 
@@ -260,27 +258,9 @@ def one(line: Line) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", default=["positions", "receiver", "points", "lengths"])
-    parser.add_argument("--num_seeds", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="lines of surveys, which are not run again")
-    asked = parser.parse_args(arguments)
-    before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
-    done = {(line["kind"], line["seed"]): line for line in map(json.loads, before)}
-    for line in done.values():
-        print(one(line))
-    for kind in asked.kinds:
-        for seed in range(asked.seed, asked.seed + asked.num_seeds):
-            if (kind, seed) in done:
-                continue
-            line = done[kind, seed] = told(kind, seed)
-            print(one(line), flush=True)
-            if asked.out is not None:
-                with asked.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
-    lines = [line for line in done.values() if line["kind"] in asked.kinds]
-    print(*list(report(lines)), sep="\n")
+    asked = seeds_parser(__doc__, ["positions", "receiver", "points", "lengths"], 20).parse_args(arguments)
+    lines = [line for line in run_seeds(asked, asked.kinds, told, one) if line["kind"] in asked.kinds]
+    print(*report(lines), sep="\n")
     found = [line for line in lines if not line["refused"]]
     shares = [[line["covered"] for line in found], [line["within"] for line in found if "within" in line]]
     return int(not found or min(float(np.mean(of)) for of in shares) < LEAST_COVERED)

@@ -23,7 +23,6 @@ mistake named. With --out each run is a line of a file, and runs that are there 
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -37,6 +36,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import lap_path
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import HALL, TAG_IN_CAM_M, Kind, MadeSurvey, expected_drift_m, in_turn, made, truth_of
+from tests.studies.kept_runs import run_seeds, seeds_parser
 
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.util.geometry.similarity import align_points, rmse
@@ -204,27 +204,12 @@ def report(lines: list[Line]) -> Iterator[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="*")
-    parser.add_argument("--num_seeds", type=int, default=6)
-    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser = seeds_parser(__doc__, None, 6)
     parser.add_argument("--data", type=Path)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
-    done = {(line["kind"], line["seed"]): line for line in map(json.loads, known)}
-    makers = surveys(args.data)
-    for seed in range(args.seed, args.seed + args.num_seeds):
-        for kind in args.kinds or makers:
-            if (kind, seed) in done:
-                continue
-            line = done[kind, seed] = told(makers[kind](seed), kind, seed)
-            print(json.dumps(line), flush=True)
-            if args.out is not None:
-                with args.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
-    for text in report(list(done.values())):
-        print(text)
+    asked = parser.parse_args()
+    makers = surveys(asked.data)
+    lines = run_seeds(asked, asked.kinds or makers, lambda kind, seed: told(makers[kind](seed), kind, seed), json.dumps)
+    print(*report(lines), sep="\n")
     return 0
 
 

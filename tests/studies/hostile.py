@@ -7,11 +7,13 @@ one or two things are made hostile. A file that the command reads is cut, emptie
 a folder, a pipe or a link, or filled with far too much. Or one of its numbers is put at or beyond its bounds, or a key
 of the survey is. Or the surroundings are odd: full or closed streams, no room for files, strange variables, Python
 files with the names of libraries in the working folder. The files are those of users (photos, logs, tables, surveys,
-plans, models, databases) and those that rangesfm wrote and reads again.
+plans, models, databases) and those that rangesfm wrote and reads again. Or files of other owners are put among inputs
+and outputs: under names that rangesfm uses, in place of files that it wrote, inside its folders, as links, and as
+further links to its files. A third of the commands that meet those are killed at a random moment, and another follows.
 
 Each command must end in time and with an exit status of the contract. An error must be one line, without a traceback or
-a library's own words. No input, nothing that a link leads to and no file that was damaged may be changed. Prints a line
-for each probe that went wrong, and how the commands ended. Exit status 1 if anything went wrong.
+a library's own words. No input, nothing that a link leads to, no file that was damaged and none of another owner may be
+changed. Prints a line for each probe that went wrong, and how the commands ended. Exit status 1 if anything went wrong.
 """
 
 from __future__ import annotations
@@ -39,10 +41,13 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from filelock import FileLock
 from pydantic.fields import FieldInfo
-from tests.studies.foreign_files import FORMATS, MODEL_FLAGS, RUN, content_of, make_template
+from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.survey import TIME_OFFSET_S
+from rangesfm.export import EXPORTED_NAMES
+from rangesfm.result.result_folder import PHOTOS_NAMES, RESULT_NAMES
+from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
 from rangesfm.survey.settings import SURVEY_TABLES
 from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
@@ -99,6 +104,9 @@ RECONSTRUCTION = (
     *("out/reconstruct.json", "out/database.db", "out/sparse", "out/mapper.log", *MODEL, *RECORDS, "out/result.json"),
     *("out/report.html", "out/trajectory.tum", "out/sparse_metric"),
 )
+FORMATS = ("colmap", "colmap_text", "undistorted", "tum", "ply", "opf", "transform", "nerfstudio", "opensfm")
+RUN = ("run", "survey.toml", "--ranges_time_offset", str(TIME_OFFSET_S), "--num_threads", "1")
+MODEL_FLAGS = ("--ranges", "uwb.csv", "--anchors", "anchors.csv", "--tag_in_cam", "0.03,-0.12,-0.05")
 TABLES_READ = ("uwb.csv", "anchors.csv", "times.csv", "reference.csv", "distances.csv", "markers.csv", "curve.csv")
 TAPED = ("--distances", "distances.csv", "--markers", "markers.csv", "--error_curve", "curve.csv")
 TIMED = ("--images", "times.csv", "--reference", "reference.csv", "--ranges_time_offset", "auto")
@@ -148,6 +156,39 @@ COMMANDS: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("check", "."), (*SURVEY, "camera.json")),
 )
 MAPS = (0, 1, 2, 5, 6)  # of COMMANDS: those that take the keys of a survey as flags
+# More commands that write where files of other owners may be.
+WRITING: tuple[tuple[str, ...], ...] = (
+    *(command for command, _ in COMMANDS if "check" not in command),
+    (*RUN, "--restart", "--formats", "tum,ply,colmap"),
+    (*RUN, "--output_path", "."),
+    (*RUN, "--check_share", "0.1"),
+    ("reconstruct", "--images", "project/images", "--output_path", "project", "--num_threads", "1"),
+    ("scale", "--input_path", "out/sparse_metric", *MODEL_FLAGS, "--output_path", "out"),
+    ("refine", "--input_path", "out/sparse/0", *MODEL_FLAGS, "--images", "out/images.csv", "--output_path", "out"),
+    ("export", "out", "--formats", ",".join(FORMATS), "--output_path", "exported"),
+    ("compare", "out", "out/sparse_scaled/0", "--output_path", "out"),
+    ("plan", "--from", "out", "--output_path", "out"),
+    ("ranges", "uwb.csv", "--output_path", "uwb.csv"),
+    ("ranges", "uwb.csv", "--output_path", "out/ranges.csv"),
+    ("init", ".", "--output_path", "out"),
+    ("demo", "."),
+    ("join", "out", "out_2", "--output_path", "out"),
+    ("join", "out", "out_2", "--output_path", "out_2/sparse"),
+)
+# Names that rangesfm uses, and folders where it does.
+NAMES = (
+    *RESULT_NAMES,
+    *RECONSTRUCTION_NAMES,
+    *PHOTOS_NAMES,
+    *(name for names in EXPORTED_NAMES.values() for name in names),
+    *("comparison.html", "plan.json", "plan.html", "figures", "applied", "batch.csv", "survey.toml"),
+    *("database.db-wal", "database.db-shm", "mapping_snapshot", "given_database", "matching", "rigs"),
+    *(".bashrc.20240101.old", ".mozilla.20210101.old", ".ranges.123.part.csv", ".result.unfinished", ".rangesfm.lock"),
+)
+FOLDERS = (
+    *("", "out", "out/sparse/0", "out/sparse_metric/0", "out/sparse_scaled", "out/colmap", "out/undistorted/dense"),
+    *("other", "exported", "project", "comparison", "plan", "new"),
+)
 PLAN = """[anchors]
 path = "anchors.csv"
 [path]
@@ -172,6 +213,7 @@ class Probe:
         held: locks that are held while the command runs.
         streams: other values of the arguments of subprocess.Popen.
         limits: for the command's process.
+        kill_after_s: when it is killed, if at all.
     """
 
     folder: Path
@@ -184,6 +226,7 @@ class Probe:
     streams: dict[str, Any] = field(default_factory=dict)
     limits: list[Callable[[], None]] = field(default_factory=list)
     flags: list[str] = field(default_factory=list)
+    kill_after_s: float | None = None
 
     def choose(self, things: Any) -> Any:
         """Return one of some things, by chance."""
@@ -193,16 +236,23 @@ class Probe:
     def protect(self, path: Path) -> None:
         self.protected[path] = state_of(path)
 
+    def protect_files_in(self, folder: Path) -> None:
+        for path in folder.rglob("*"):
+            if path.is_file() or path.is_symlink():
+                self.protect(path)
+
     def changed(self) -> list[str]:
         """List the protected paths that are no longer what they were."""
         return [str(path) for path, before in self.protected.items() if state_of(path) != before]
 
 
 def state_of(path: Path) -> bytes | str:
-    """Return the content of a file, or a word for the kind of whatever else is there."""
-    if path.is_fifo():
-        return "pipe"
-    return "folder" if path.is_dir() and not path.is_symlink() else content_of(path)
+    """Return the content of a file, the target of a link, or a word for the kind of whatever else is there."""
+    if path.is_symlink():
+        return os.readlink(path)
+    if path.is_file():
+        return path.read_bytes()
+    return "folder" if path.is_dir() else "pipe" if path.is_fifo() else "gone"
 
 
 def damage_a_file(probe: Probe, names: tuple[str, ...]) -> None:
@@ -308,7 +358,7 @@ def replace_by(probe: Probe, path: Path, kind: str) -> None:
     elif kind == "pipe":
         os.mkfifo(path)
     elif kind == "file":
-        path.write_text("mine\n")
+        path.write_bytes(probe.rng.bytes(100))
     elif kind != "removed":
         targets: dict[str, Path | str] = {
             "link": probe.outside / "file.txt",
@@ -330,6 +380,89 @@ def locked(path: Path) -> Iterator[None]:
         (output / PRIVATE_NAME).mkdir(exist_ok=True)
         with FileLock(output / LOCK_NAME, is_singleton=True):  # one probe may lock the same folder twice
             yield
+
+
+def put_foreign_files(probe: Probe) -> None:
+    """Put files that rangesfm did not write among inputs and outputs, or turn files that it wrote into such."""
+    rng = probe.rng
+    changes = [place_somewhere] * int(rng.integers(1, 12)) + [link_an_own_file] * int(rng.integers(0, 4))
+    if rng.random() < 0.5:
+        changes += [change_an_own_file] * int(rng.integers(1, 4))
+    if rng.random() < 0.1:
+        changes.append(move_a_folder_away)
+    for k in rng.permutation(len(changes)):
+        changes[k](probe)
+    if rng.random() < 0.1 and (probe.folder / "out" / PRIVATE_NAME).is_dir():
+        # As the result of a version that kept no record, in which all files count as foreign.
+        shutil.rmtree(probe.folder / "out" / PRIVATE_NAME)
+        probe.protect_files_in(probe.folder / "out")
+    probe.said.append("foreign files")
+
+
+def place_somewhere(probe: Probe) -> None:
+    """Put a file, a folder that holds one, or a link under a name that rangesfm uses."""
+    parent = probe.folder / probe.choose(FOLDERS)
+    path = parent / probe.choose(NAMES)
+    if any(other.is_symlink() or other.is_file() for other in (parent, *parent.parents)):
+        return
+    if os.path.lexists(path):
+        if path.is_dir() and not path.is_symlink():
+            path /= "mine.txt"
+        if os.path.lexists(path):
+            return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kind = probe.choose(["file", "folder", "link", "dead link", "hard link"])
+    if kind == "hard link":
+        os.link(probe.outside / "file.txt", path)
+    else:
+        replace_by(probe, path, kind)
+    if kind != "folder":
+        probe.protect(path)
+
+
+def own_files(probe: Probe) -> list[Path]:
+    """List the files that the earlier run left, without the hidden records."""
+    files = [path for path in (probe.folder / "out").rglob("*") if path.is_file() and not path.is_symlink()]
+    return sorted(path for path in files if PRIVATE_NAME not in path.parts and path not in probe.protected)
+
+
+def change_an_own_file(probe: Probe) -> None:
+    """Turn a file that rangesfm wrote into a foreign one, by changing or replacing its content, or by a link."""
+    if not (own := own_files(probe)):
+        return
+    path, kind = probe.choose(own), probe.choose(["same file", "new file", "appended", "same size", "link"])
+    data = path.read_bytes()
+    # otherwise the content under its other name would change as well
+    if kind in ("new file", "link") or path.stat().st_nlink > 1:
+        path.unlink()
+    if kind == "link":
+        replace_by(probe, path, kind)
+    elif kind == "appended":
+        path.write_bytes(data + b"\n# mine\n")
+    else:
+        path.write_bytes(probe.rng.bytes(max(1, len(data) if kind == "same size" else 100)))
+    probe.protect(path)
+
+
+def link_an_own_file(probe: Probe) -> None:
+    """Give a file that rangesfm wrote another name outside, as backups by hard links do."""
+    if own := own_files(probe):
+        backup = probe.outside / f"backup_{len(probe.protected)}"
+        os.link(probe.choose(own), backup)
+        probe.protect(backup)
+
+
+def move_a_folder_away(probe: Probe) -> None:
+    """Move a folder of results to another place, and leave a link."""
+    folders = [path for path in (probe.folder / "out").iterdir() if path.is_dir() and path.name != PRIVATE_NAME]
+    if folders := sorted(path for path in folders if not path.is_symlink()):
+        path = probe.choose(folders)
+        for file in [file for file in probe.protected if file.is_relative_to(path)]:
+            probe.protected.pop(file)
+        moved = Path(shutil.move(path, probe.outside / f"moved_{path.name}"))
+        path.symlink_to(moved)
+        probe.protect(path)
+        probe.protect_files_in(moved)
 
 
 def set_a_key(probe: Probe) -> None:
@@ -370,10 +503,7 @@ KEYS_AT_BOUNDS = _keys_at_bounds()
 
 def make_surroundings_odd(probe: Probe) -> None:
     """Choose odd surroundings for the command."""
-    rng, kind = (
-        probe.rng,
-        probe.choose(["variable", "variable", "room", "streams", "library", "folder of temporary files"]),
-    )
+    kind = probe.choose(["variable", "variable", "room", "streams", "library", "folder of temporary files"])
     if kind == "variable":
         name = probe.choose(
             ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LC_ALL", "HOME", "TMPDIR", "COLUMNS", "PYTHONHASHSEED"]
@@ -382,9 +512,7 @@ def make_surroundings_odd(probe: Probe) -> None:
         probe.environment[name] = probe.choose(values)
         kind = f"{name}={probe.environment[name]}"
     elif kind == "room":
-        max_bytes = int(10 ** rng.uniform(2, 6.5))
-        probe.limits.append(lambda: _limit_file_size(max_bytes))
-        kind = f"files up to {max_bytes} bytes"
+        kind = limit_file_size(probe)
     elif kind == "streams":
         name, what = probe.choose(["stdout", "stderr"]), probe.choose(["full", "closed"])
         number = {"stdout": 1, "stderr": 2}[name]
@@ -408,15 +536,29 @@ def _lead_to_nowhere(number: int, is_full: bool) -> None:
         os.close(number)
 
 
-def _limit_file_size(max_bytes: int) -> None:
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
+def limit_file_size(probe: Probe) -> str:
+    """Let the command write no file beyond a random size, as on a full disk; return the limit in words."""
+    max_bytes = int(10 ** probe.rng.uniform(2, 6.5))
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
+
+    probe.limits.append(limit)
+    return f"files up to {max_bytes} bytes"
 
 
-def make_site(folder: Path) -> None:
-    """Make the survey that probes copy: that of ``foreign_files`` with a file of each further kind."""
-    make_template(folder)
-    survey = folder / "survey"
+def make_template(folder: Path) -> None:
+    """Make the survey that probes copy: with two results, exports, a project in COLMAP's layout, and further files."""
+    survey = make_small_demo(folder / "survey", num_photos=10).folder
+    for command in (RUN, ("export", "out", "--formats", ",".join(FORMATS)), ("report", "out")):
+        done = subprocess.run([sys.executable, "-m", "rangesfm", *command], cwd=survey, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+    shutil.copytree(survey / "out", survey / "out_2")
+    shutil.copytree(survey / "images", survey / "project" / "images")
+    shutil.copytree(survey / "out" / "sparse", survey / "project" / "sparse")
+    shutil.copyfile(survey / "out" / "database.db", survey / "project" / "database.db")
     shutil.copyfile(survey / "out" / "images.csv", survey / "times.csv")
     rows = [line.split(",") for line in (survey / "times.csv").read_text().splitlines()[1:]]
     names, times = [row[0] for row in rows], np.array([float(row[1]) for row in rows])
@@ -455,20 +597,29 @@ def prepared(template: Path, folder: Path, rng: np.random.Generator) -> tuple[Pr
         if path.relative_to(probe.folder).parts[0] not in ("out", "out_2", PRIVATE_NAME) and path.is_file():
             probe.protect(path)
     number = int(rng.integers(len(COMMANDS)))
-    kind = rng.choice(["file", "two files", "file", "key", "surroundings"])
+    kind = rng.choice(["file", "two files", "file", "key", "surroundings", "foreign files", "foreign files"])
     if kind == "key":
         number = MAPS[number % len(MAPS)]
         set_a_key(probe)
     command, names = COMMANDS[number]
     if kind == "surroundings":
         make_surroundings_odd(probe)
+    if kind == "foreign files":
+        put_foreign_files(probe)
+        command = probe.choose(WRITING)
+        if rng.random() < 0.1:
+            limit_file_size(probe)
+        probe.kill_after_s = rng.exponential(4.0) if rng.random() < 1 / 3 else None
     for _ in range({"file": 1, "two files": 2}.get(str(kind), 0)):
         damage_a_file(probe, names)
     return probe, (*command, *probe.flags)
 
 
 def start(command: tuple[str, ...], probe: Probe) -> tuple[int | None, str, str]:
-    """Run a command; return its exit status, None if it does not end, its output, and its error output."""
+    """Run a command; return its exit status, its output, and its error output.
+
+    The status is None if the command does not end, and that of SIGKILL if it was killed at the probe's moment.
+    """
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (MAX_BYTES, MAX_BYTES))
@@ -486,11 +637,11 @@ def start(command: tuple[str, ...], probe: Probe) -> tuple[int | None, str, str]
         **streams,
     )
     try:
-        output, errors = process.communicate(timeout=MAX_SECONDS)
+        output, errors = process.communicate(timeout=probe.kill_after_s or MAX_SECONDS)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
-        return None, "", ""
+        return None if probe.kill_after_s is None else -signal.SIGKILL, "", ""
     return process.returncode, output or "", errors or ""
 
 
@@ -520,12 +671,16 @@ def main() -> int:
     arguments = parser.parse_args()
     ended, num_wrong = Counter[str](), 0
     with tempfile.TemporaryDirectory() as name:
-        make_site(Path(name) / "template")
+        make_template(Path(name) / "template")
         for number in range(arguments.first, arguments.first + arguments.num_probes):
             rng, folder = np.random.default_rng([arguments.seed, number]), Path(name) / "probe"
             probe, command = prepared(Path(name) / "template" / "survey", folder, rng)
             with probe.held:
                 status, output, errors = start(command, probe)
+                if status == -signal.SIGKILL:
+                    ended[f"{command[0]} killed"] += 1
+                    probe.kill_after_s, command = None, probe.choose(WRITING)
+                    status, output, errors = start(command, probe)
                 wrong = what_is_wrong(status, output, errors, probe)
             ended[f"{command[0]} {status}"] += 1
             num_wrong += wrong is not None

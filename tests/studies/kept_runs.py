@@ -4,14 +4,66 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 Row = dict[str, Any]
+
+
+class KeptRuns:
+    """The runs of a study that are done, which a file keeps as JSON lines (None: nothing is kept).
+
+    ``names`` are those of the values that say which run a line is.
+    """
+
+    def __init__(self, file: Path | None, *names: str) -> None:
+        self._file = file
+        kept = file.read_text(encoding="utf-8").splitlines() if file is not None and file.exists() else []
+        lines: list[Row] = [json.loads(line) for line in kept]
+        self._done = {str([line[name] for name in names]): line for line in lines}
+
+    @property
+    def rows(self) -> list[Row]:
+        return list(self._done.values())
+
+    def has(self, **which: Any) -> bool:
+        return str([*which.values()]) in self._done
+
+    def run(self, make: Callable[[], Row], **which: Any) -> Row:
+        """Return the line of a run; a missing one is made and added to the file."""
+        key = str([*which.values()])
+        if key not in self._done:
+            self._done[key] = which | make()
+            if self._file is not None:
+                with self._file.open("a", encoding="utf-8") as lines:
+                    print(json.dumps(self._done[key]), file=lines)
+        return self._done[key]
+
+
+def seeds_parser(doc: str | None, kinds: Sequence[str] | None, num_seeds: int) -> argparse.ArgumentParser:
+    """Return the command line of a study that runs kinds of surveys, each with many seeds."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="+", default=kinds)
+    parser.add_argument("--num_seeds", type=int, default=num_seeds)
+    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser.add_argument("--out", type=Path, help="keeps the runs, which are not made again")
+    return parser
+
+
+def run_seeds(
+    asked: argparse.Namespace, kinds: Iterable[str], told: Callable[[str, int], Row], show: Callable[[Row], str]
+) -> list[Row]:
+    """Run each kind with each seed, show each run, and return the lines of all that were ever kept."""
+    kept = KeptRuns(asked.out, "kind", "seed")
+    for kind in kinds:
+        for seed in range(asked.seed, asked.seed + asked.num_seeds):
+            print(show(kept.run(partial(told, kind, seed), kind=kind, seed=seed)), flush=True)
+    return kept.rows
 
 
 @dataclass(frozen=True)
@@ -29,15 +81,9 @@ class Study:
     beginning: str
 
     def runs_of(self, name: str, run: Callable[[int], Row]) -> list[Row]:
-        """Return the runs of a survey from the file; missing ones are made and added to the file."""
-        kept = [json.loads(line) for line in self.file.read_text().splitlines()] if self.file.exists() else []
-        rows = [row for row in kept if row["survey"] == name and row["seed"] < self.num_seeds]
-        done = {row["seed"] for row in rows}
-        with self.file.open("a") as lines:
-            for seed in (seed for seed in range(self.num_seeds) if seed not in done):
-                rows.append({"survey": name, "seed": seed} | run(seed))
-                print(json.dumps(rows[-1]), file=lines, flush=True)
-        return rows
+        """Return the runs of a survey."""
+        kept = KeptRuns(self.file, "survey", "seed")
+        return [kept.run(partial(run, seed), survey=name, seed=seed) for seed in range(self.num_seeds)]
 
 
 def study(doc: str | None) -> Study:

@@ -22,20 +22,19 @@ and named, and which were. Exit status 1 if less than 90 % of the scales are cov
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, Truth, photos_adjuster, simulated
+from tests.studies.kept_runs import KeptRuns, seeds_parser
 from tests.studies.measured_distances import KINDS, marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
@@ -294,31 +293,24 @@ def summary_of(lines: Sequence[Line]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", default=KINDS_OF_SURVEY, choices=KINDS)
+    parser = seeds_parser(__doc__, KINDS_OF_SURVEY, 15)
     parser.add_argument("--with", nargs="+", default=["points"], dest="known")
     parser.add_argument("--mistakes", nargs="+", default=["none"], choices=MISTAKES)
-    parser.add_argument("--num_seeds", type=int, default=15)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="lines of surveys, which are not run again")
     asked = parser.parse_args(arguments)
-    before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
-    done = {tuple(line["which"]): line for line in map(json.loads, before)}
+    kept = KeptRuns(asked.out, "known", "mistake", "kind", "seed")
     for name, seed in itertools.product(asked.kinds, range(asked.seed, asked.seed + asked.num_seeds)):
         kind, made = KINDS[name], None
         for known, mistake in itertools.product(asked.known, asked.mistakes):
-            if (which := (known, mistake, name, seed)) in done:
-                continue
-            made = made or simulated(replace(kind, anchor_frame="site"), seed)
-            of_survey = Known.of(known.split("+"), *made, kind.path(seed), seed)
-            done[which] = told(of_survey, mistake, kind.pixel_stddev, seed)
-            if asked.out is not None:
-                with asked.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"which": which, **done[which]}) + "\n")
+            which = {"known": known, "mistake": mistake, "kind": name, "seed": seed}
+            if not kept.has(**which):
+                made = made or simulated(replace(kind, anchor_frame="site"), seed)
+                of_survey = Known.of(known.split("+"), *made, kind.path(seed), seed)
+                kept.run(partial(told, of_survey, mistake, kind.pixel_stddev, seed), **which)
     for known, mistake, name in itertools.product(asked.known, asked.mistakes, [*asked.kinds, "all"]):
-        lines = [line for which, line in done.items() if which[:2] == (known, mistake) and name in ("all", which[2])]
+        alike = [line for line in kept.rows if (line["known"], line["mistake"]) == (known, mistake)]
+        lines = [line for line in alike if name in ("all", line["kind"])]
         print(f"{known}, {name}, mistake: {mistake}: {summary_of(lines)}", flush=True)
-    clean = [line for which, line in done.items() if which[1] == "none" and not line["refused"]]
+    clean = [line for line in kept.rows if line["mistake"] == "none" and not line["refused"]]
     return int(bool(clean) and np.mean([line["covered"] for line in clean]) < LEAST_COVERED)
 
 

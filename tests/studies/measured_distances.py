@@ -17,12 +17,9 @@ status 1 if the share of distances between marks, over all surveys, is not withi
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +28,7 @@ from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import HALL, SITE_ANCHORS_M, Kind, Truth, simulated
 from tests.studies.drifting_maps import MAST_M
+from tests.studies.kept_runs import run_seeds, seeds_parser
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
@@ -228,25 +226,11 @@ def report(lines: list[Line]) -> Iterator[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="*")
-    parser.add_argument("--num_seeds", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0, help="the first")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
-    done = {(line["kind"], line["seed"]): line for line in map(json.loads, known)}
-    for seed in range(args.seed, args.seed + args.num_seeds):
-        for kind in args.kinds or KINDS:
-            if (kind, seed) in done:
-                continue
-            line = done[kind, seed] = told(kind, seed)
-            if args.out is not None:
-                with args.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
-    lines = list(done.values())
-    for text in report(lines):
-        print(text)
+    asked = seeds_parser(__doc__, list(KINDS), 20).parse_args()
+    lines = run_seeds(
+        asked, asked.kinds, told, lambda line: f"{line['kind']}, {line['seed']}: {line['refused'] or line['verdict']}"
+    )
+    print(*report(lines), sep="\n")
     share, _, _ = share_covered([line for line in lines if not line["refused"]], "marks")
     return 0 if WANTED[0] <= share <= WANTED[1] else 1
 

@@ -42,6 +42,7 @@ import numpy.typing as npt
 import pycolmap
 from tests.studies.drawn_surveys import DrawnSurvey, draw
 from tests.studies.hostile import OWN_WORDS, STATUSES
+from tests.studies.kept_runs import KeptRuns
 
 from rangesfm.cli import main as rangesfm
 from rangesfm.util.geometry.similarity import align_points
@@ -270,17 +271,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         line = told(asked.seed, asked.keep, echo=True, pairs=asked.pairs)
         print(json.dumps(line), *failures(line), sep="\n")
         return int(bool(failures(line)))
-    before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
-    done = {line["seed"]: line for line in map(json.loads, before)}
-    seeds = [seed for seed in range(asked.first_seed, asked.first_seed + asked.num) if seed not in done]
+    kept = KeptRuns(asked.out, "seed")
+    seeds = [seed for seed in range(asked.first_seed, asked.first_seed + asked.num) if not kept.has(seed=seed)]
     for line in outcomes(seeds, asked.workers, pairs=asked.pairs):
-        done[line["seed"]] = line
+        kept.run(line.copy, seed=line["seed"])
         if found := failures(line):
             print(f"{line['seed']}: {'; '.join(found)}: {line['words']}", flush=True)
-        if asked.out is not None:
-            with asked.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
-    texts, is_well = report([done[seed] for seed in sorted(done)])
+    texts, is_well = report(sorted(kept.rows, key=lambda line: int(line["seed"])))
     print(*texts, sep="\n")
     return int(not is_well)
 
