@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
+from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.positions.known_positions import KnownPositions
 
 
@@ -29,7 +30,5 @@ def known_positions(is_mark: list[bool], num_poses: int = 1, stddev_m: float = 0
         world_from_cam=np.zeros((k, 3, 3)),
         by_pose=csr_array((3 * k, 6 * num_poses)),
         arms_by_pose=csr_array((3 * k, 6 * num_poses)),
-        on_path=np.full((k, 2), -1, dtype=np.int64),
-        fraction=np.zeros(k),
-        from_line=np.zeros((k, 3)),
+        on_path=AntennaPlaces.nowhere(k),
     )

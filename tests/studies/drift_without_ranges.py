@@ -98,7 +98,7 @@ class Drifting:
         at_m = self.path.centers(times) + self.path.world_from_cam(times) @ TAG_IN_CAM_M
         at_m = at_m + receiver.errors_m(times, self.rng)
         covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
-        names = self.survey.trajectory.image_names if of_photos else None
+        names = self.survey.trajectory.image_names if of_photos else ()
         log = PositionLog(at_m, covariances, None if of_photos else times, names, np.arange(len(times)))
         offset = None if of_photos else TimeOffset.given(0.0)
         return SurveyedPositions(antenna=AntennaTrack(log, TAG_IN_CAM_M, offset, RangesOptions()))

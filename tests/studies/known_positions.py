@@ -108,7 +108,7 @@ def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> 
     times, receiver = np.arange(first_s, last_s, 1.0), RECEIVERS["positions"]
     true_m = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
     covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
-    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, times, None, np.arange(len(times)))
+    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, times, (), np.arange(len(times)))
     return AntennaTrack(log, TAG_IN_CAM_M, None, RangesOptions())
 
 

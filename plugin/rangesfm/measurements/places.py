@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,8 @@ class AntennaPlaces:
         before, after: (n,) indices of keyframes; -1 where there is no place.
         fraction: (n,) of the later one, in [0, 1].
         interval_s: (n,) time between the two, 0 at a keyframe.
-        offset_m: (n, 3) deviation of the curved path from the straight line, in the metric world.
+        offset_m: (n, 3) deviation of the curved path from the straight line, in the metric world; in the unit of an
+            unscaled model for places of the camera on its path.
     """
 
     before: Indices
@@ -29,9 +32,20 @@ class AntennaPlaces:
     interval_s: Array
     offset_m: Array
 
+    @classmethod
+    def nowhere(cls, num: int) -> AntennaPlaces:
+        """Return n times without a place."""
+        none = np.full(num, -1, dtype=np.int64)
+        return cls(none, none, np.zeros(num), np.zeros(num), np.zeros((num, 3)))
+
     def subset(self, rows: Indices) -> AntennaPlaces:
         """Return some of the places."""
         return AntennaPlaces(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def joined(self, others: AntennaPlaces) -> AntennaPlaces:
+        """Return these places followed by others."""
+        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(self))
+        return AntennaPlaces(*map(np.concatenate, pairs))
 
     def at(self, poses: Poses, arms_m: Array, later_s: float = 0.0) -> Array:
         """Return the (n, 3) places.
@@ -60,6 +74,21 @@ class AntennaPlaces:
     def _at_keyframe(poses: Poses, index: Indices, arms_m: Array) -> Array:
         turned: Array = np.einsum("nij,nj->ni", poses.world_from_rig[index], arms_m)
         return poses.centers[index] + turned
+
+    def on_map(
+        self, path: Trajectory, arms_in_cam_m: Array, arms_m: Array, metric_from_sfm: Similarity
+    ) -> AntennaPlaces:
+        """Return the places in a metric map, given those of the camera on the path of an unscaled model.
+
+        Args:
+            path: on which the places are. arms_in_cam_m: (n, 3) antennas in the rig's frame.
+            arms_m: (n, 3) these in the axes of the path's world, as they turn between keyframes.
+            metric_from_sfm: from the world of the path to that of the map.
+        """
+        unmoved = Poses(path.world_from_cam, np.zeros_like(path.centers))
+        turned_m = replace(self, offset_m=np.zeros_like(self.offset_m)).at(unmoved, arms_in_cam_m)
+        beyond_m = metric_from_sfm.scale * self.offset_m + arms_m - turned_m
+        return replace(self, offset_m=beyond_m @ metric_from_sfm.rotation.T)
 
     @property
     def keyframes(self) -> Indices:

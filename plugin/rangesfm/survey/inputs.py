@@ -84,7 +84,7 @@ class RangingInputs:
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
         for markers in filter(None, [points.markers or tape.markers]):
             yield f"marks in {_name(next(iter(markers.values())).path)}", _photos_of(markers)
-        if antenna is not None and antenna.log.image_name is not None:
+        if antenna is not None and antenna.log.image_name:
             yield f"positions in {_name(antenna.log.path)}", antenna.log.image_name
         if self.log.image_name is not None:
             yield f"ranges in {_name(self.log.source)}", self.log.image_name

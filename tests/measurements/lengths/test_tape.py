@@ -57,5 +57,5 @@ def test_a_wrong_table_of_distances_is_named(text: str, said: str, tmp_path: Pat
 
 def test_a_marker_twice_in_one_photo_is_refused(tmp_path: Path) -> None:
     markers = write(tmp_path / "m.csv", "marker,image_name,x_px,y_px\ndoor,a.jpg,1,2\ndoor,a.jpg,5,6.5\n")
-    with pytest.raises(InputError, match=r"m.csv:3: image_name is 'a.jpg', expected each photo once"):
+    with pytest.raises(InputError, match=r"m.csv:3: marker door is twice in a.jpg, expected once"):
         read_markers(markers)

@@ -35,12 +35,10 @@ class LocatedDistances:
         anchor_pair: (k, 2) int, indices of the two anchors; -1 between points.
         distance_m, stddev_m: (k,) measured length and its standard deviation.
         is_check: (k,) bool, lengths that do not take part in the estimate.
-        ends: (k, 2, 3) the two points in the model's world and unit; NaN if unknown.
         mark_stddev: (k,) standard deviation of the model's length due to errors of marks in photos, in its unit.
         is_printed: (k,) bool, sides of printed tags, which share one error of their size.
-        is_everywhere: (k,) bool, lengths that occur all along the map, so that its bending does not matter.
         by_pose: (k, 6 n) sparse derivatives of the model's length by the n poses of a path, as of ``KnownPositions``;
-            zero where they do not matter or are not known.
+            zero where they are not known, and for lengths that occur all along the map, whose bending does not matter.
     """
 
     model_length: Array
@@ -48,19 +46,16 @@ class LocatedDistances:
     distance_m: Array
     stddev_m: Array
     is_check: Mask
-    ends: Array
     mark_stddev: Array
     is_printed: Mask
-    is_everywhere: Mask
     by_pose: csr_array
 
     @classmethod
     def between_points(cls, distance_m: Array, stddev_m: Array, model_length: Array) -> LocatedDistances:
         """Make control lengths between points whose positions are unknown."""
         k = len(distance_m)
-        no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
-        pair = np.full((k, 2), -1, dtype=np.int64)
-        return cls(model_length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no, csr_array((k, 0)))
+        no, pair = np.zeros(k, dtype=bool), np.full((k, 2), -1, dtype=np.int64)
+        return cls(model_length, pair, distance_m, stddev_m, no, np.zeros(k), no, csr_array((k, 0)))
 
     @classmethod
     def between_anchors(cls, distance_m: Array, stddev_m: Array, anchor_pair: Indices) -> LocatedDistances:
@@ -145,15 +140,16 @@ def locate_distances(
             marks of a marker are too few, seen from one direction only, or not of one point. The error gives the line.
     """
     points, num = NamedPoints.in_model(model, tape.markers, first_ids=frame_ids), len(tape.distances)
-    ends, mark_stddev, by_pose = np.full((num, 2, 3), np.nan), np.zeros(num), np.zeros((num, 6 * len(frame_ids)))
+    length, mark_stddev, by_pose = np.full(num, np.nan), np.zeros(num), np.zeros((num, 6 * len(frame_ids)))
     pairs = np.full((num, 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
         if all(name in points for name in taped.ends):
             start, end = (points.find(name) for name in taped.ends)
-            ends[row] = start.position_m, end.position_m
+            away = end.position_m - start.position_m
+            length[row] = np.linalg.norm(away)
             mark_stddev[row] = np.sqrt(variance_along(start.position_m, end.position_m, start.own_m2 + end.own_m2))
             if not taped.is_everywhere:
-                along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
+                along = away / max(length[row], 1e-12)
                 by_pose[row] = along @ (points.by_pose(end, len(frame_ids)) - points.by_pose(start, len(frame_ids)))
         elif set(anchor_ids).issuperset(taped.ends):
             pairs[row] = [anchor_ids.index(name) for name in taped.ends]
@@ -161,15 +157,13 @@ def locate_distances(
             known = [*points.views, *points.markers]
             raise InputError(_what_is_wrong(taped, known, anchor_ids), tape.distances_path, taped.line)
     return LocatedDistances(
-        np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
+        length,
         pairs,
         np.array([taped.distance_m for taped in tape.distances], dtype=np.float64),
         np.array([taped.stddev_m for taped in tape.distances], dtype=np.float64),
         np.array([taped.kind != CONTROL for taped in tape.distances], dtype=bool),
-        ends,
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
-        np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
         csr_array(by_pose),
     )
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from xml.parsers import expat
 
 from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.tape import Mark
 from rangesfm.options import COORDINATE_M, PIXEL
 from rangesfm.util.files.contents import open_regular
-from rangesfm.util.files.text_tables import repeated
 
 _EXPECTED = "expected the markers of one chunk, as Metashape exports them"
 
@@ -22,13 +22,13 @@ class MetashapeMarkers:
     """Markers of one chunk.
 
     Attributes:
-        seen: names of photos, pixels and lines in the file by name of the marker.
+        seen: marks by name of the marker.
         places: reference coordinates, the standard deviation of each (None if there is none), whether they are enabled
             (Metashape's control points), and the line in the file, by name of the marker.
         system: text of the coordinate system (WKT).
     """
 
-    seen: dict[str, list[tuple[str, list[float], int]]] = field(default_factory=dict)
+    seen: dict[str, list[Mark]] = field(default_factory=dict)
     places: dict[str, tuple[list[float], float | None, bool, int]] = field(default_factory=dict)
     system: str = ""
 
@@ -90,8 +90,4 @@ def read_metashape_markers(path: Path) -> MetashapeMarkers:
         raise InputError(f"no whole XML file, {_EXPECTED}", path, error.lineno) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
-    for name, rows in found.seen.items():
-        if again := repeated([photo for photo, _, _ in rows]):
-            photo, _, line = rows[again[0]]
-            raise InputError(f"marker {name} is twice in {photo}, expected once", path, line)
     return found

@@ -15,6 +15,8 @@ CLICKED_STDDEV_PX = 1.0
 """Standard deviation of a coordinate of a mark set by hand."""
 FOUND_STDDEV_PX = 0.3
 """Standard deviation of a coordinate of a tag's corner that was found by OpenCV."""
+Mark = tuple[str, list[float], int]
+"""Name of a photo, the pixel (x, y) of a marker in it, and the line in the file."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
-from rangesfm.measurements.lengths.metashape import MetashapeMarkers, is_metashape_file, read_metashape_markers
-from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, Tape, TapedDistance
+from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
+from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Mark, Marker, Tape, TapedDistance
 from rangesfm.measurements.ranges.readers.lists import ListRows
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 from rangesfm.util.files.contents import AnyPath
@@ -62,28 +62,29 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
         InputError: the file is not valid; the error gives the line.
     """
     if is_metashape_file(read_head(path)):
-        return markers_of_metashape(read_metashape_markers(Path(path)), Path(path), stddev_px)
+        return markers_of_marks(read_metashape_markers(Path(path)).seen, Path(path), stddev_px)
     listed = MARKS.read(Path(path))
-    names, image_names = listed.text("marker"), listed.text("image_name")
     pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
-    rows_of: dict[str, list[int]] = {}
-    for row, name in enumerate(names):
-        rows_of.setdefault(name, []).append(row)
-    markers = {}
-    for name, rows in rows_of.items():
-        seen_in = tuple(image_names[row] for row in rows)
-        if again := repeated(seen_in):
-            raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
-        lines = tuple(listed.table.line[rows].tolist())
-        markers[name] = Marker(seen_in, pixels[rows], lines, stddev_px, Path(path))
-    return markers
+    seen: dict[str, list[Mark]] = {}
+    rows = zip(listed.text("image_name"), pixels.tolist(), listed.table.line.tolist(), strict=True)
+    for name, mark in zip(listed.text("marker"), rows, strict=True):
+        seen.setdefault(name, []).append(mark)
+    return markers_of_marks(seen, Path(path), stddev_px)
 
 
-def markers_of_metashape(read: MetashapeMarkers, path: Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
-    """Return the marks in photos of Metashape's markers, which were read from a file."""
+def markers_of_marks(
+    seen: Mapping[str, Sequence[Mark]], path: Path, stddev_px: float = CLICKED_STDDEV_PX
+) -> dict[str, Marker]:
+    """Return markers by name, given the marks of each that a file holds.
+
+    Raises:
+        InputError: a marker is twice in one photo; the error gives the line.
+    """
     markers = {}
-    for name, rows in read.seen.items():
-        photos, pixels, lines = zip(*rows, strict=True)
+    for name, marks in seen.items():
+        photos, pixels, lines = zip(*marks, strict=True)
+        if again := repeated(photos):
+            raise InputError(f"marker {name} is twice in {photos[again[0]]}, expected once", path, lines[again[0]])
         markers[name] = Marker(photos, np.array(pixels), lines, stddev_px, path)
     return markers
 

@@ -64,7 +64,8 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         velocity = (1 - fraction)[:, None] * at_keyframes[before] + fraction[:, None] * at_keyframes[after]
         at_s = times_s[before] if track.log.timestamp_s is None else _times_s(track)[rows]
     names = _names(track)
-    places = AntennaPlaces(before, after, fraction, np.zeros(k), on_path.offsets)
+    interval_s = np.zeros(k) if times_s is None else times_s[after] - times_s[before]
+    places = AntennaPlaces(before, after, fraction, interval_s, on_path.offsets)
     parts = places.by_pose(Poses(path.world_from_cam, path.centers), arms_m, np.tile(np.eye(3), (k, 1, 1)))
     return KnownPositions(
         names=tuple(names[row] for row in rows.tolist()),
@@ -84,9 +85,7 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         world_from_cam=path.world_from_cam[np.where(fraction < 0.5, before, after)],
         by_pose=_sparse(parts * [0, 0, 0, 1, 1, 1], places.keyframes, len(path)),
         arms_by_pose=_sparse(parts * [1, 1, 1, 0, 0, 0], places.keyframes, len(path)),
-        on_path=places.keyframes,
-        fraction=fraction,
-        from_line=on_path.offsets,
+        on_path=places,
     )
 
 
@@ -96,16 +95,15 @@ def _times_s(track: AntennaTrack) -> Array:
 
 
 def _names(track: AntennaTrack) -> list[str]:
-    if track.log.image_name is not None:
+    if track.log.timestamp_s is None:
         return [*track.log.image_name]
-    assert track.log.timestamp_s is not None, "positions by time"
     return [time_text(time_s) for time_s in track.log.timestamp_s.tolist()]
 
 
 def _places(track: AntennaTrack, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
     """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
     log, options = track.log, track.association
-    if log.image_name is not None:
+    if log.timestamp_s is None:
         at = rows_of_photos(log.image_name, path.image_names)
         rows = np.flatnonzero(at >= 0)
         return rows, at[rows], at[rows], np.zeros(len(rows))

@@ -119,7 +119,7 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         GeometryError: the motion does not determine the offset.
     """
     if track.log.timestamp_s is None:
-        listed = track.log.image_name or ()
+        listed = track.log.image_name
         if np.all(rows_of_photos(listed, path.image_names) < 0):
             raise InputError(told_none("the file", listed, path.image_names), track.log.path)
         return track

@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
-from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
-from rangesfm.measurements.lengths.tape_file import markers_of_metashape
+from rangesfm.measurements.lengths.tape import CHECK, CONTROL, Mark
+from rangesfm.measurements.lengths.tape_file import markers_of_marks
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_log import crs_in_text, crs_of_line
 from rangesfm.measurements.ranges.anchors.anchor_file import find_anchor_columns, like_anchors
@@ -125,7 +125,7 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
 
     A point without a name is known by its coordinates.
     """
-    crs, points, marks = "", dict[str, ControlPoint](), dict[str, list[tuple[str, list[float], int]]]()
+    crs, points, marks = "", dict[str, ControlPoint](), dict[str, list[Mark]]()
     for line, text in enumerate(read_text(path).split("\n"), 1):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
@@ -142,8 +142,7 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
             message = f"point {name} has other coordinates than in line {points[name].line}, expected the same"
             raise InputError(message, path, line)
         marks.setdefault(name, []).append((image_name, numbers[3:], line))
-    markers = {name: _marker(name, seen, path) for name, seen in marks.items()}
-    return ControlPoints(tuple(points.values()), markers, False, crs, path)
+    return ControlPoints(tuple(points.values()), markers_of_marks(marks, path), False, crs, path)
 
 
 def _metashape(path: Path, options: PointOptions, _head: str) -> ControlPoints:
@@ -156,7 +155,7 @@ def _metashape(path: Path, options: PointOptions, _head: str) -> ControlPoints:
     if not points:
         raise InputError("its markers have no coordinates: give them in another file, and this one by --markers", path)
     are_stated = all(stddev for _, stddev, _, _ in read.places.values())
-    return ControlPoints(points, markers_of_metashape(read, path), are_stated, crs_in_text(read.system), path)
+    return ControlPoints(points, markers_of_marks(read.seen, path), are_stated, crs_in_text(read.system), path)
 
 
 def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:
@@ -172,10 +171,3 @@ def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, s
     if not is_right:
         raise InputError(f"is no line of a point, expected {_GCP_COLUMNS}", path, line)
     return numbers, cells[_NUM_GCP_NUMBERS], cells[_NUM_GCP_NUMBERS + 1] if len(cells) > _NUM_GCP_NUMBERS + 1 else ""
-
-
-def _marker(name: str, seen: Sequence[tuple[str, list[float], int]], path: Path) -> Marker:
-    photos, pixels, lines = zip(*seen, strict=True)
-    if again := repeated(photos):
-        raise InputError(f"point {name} is twice in {photos[again[0]]}, expected once", path, lines[again[0]])
-    return Marker(photos, np.array(pixels), lines, CLICKED_STDDEV_PX, path)

@@ -12,6 +12,7 @@ from scipy.sparse import csr_array, vstack
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.measurements.lengths.tape import CONTROL, Marker
+from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -114,7 +115,5 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         world_from_cam=np.zeros((k, 3, 3)),
         by_pose=vstack([csr_array((0, 6 * len(path))), *by_pose], format="csr"),
         arms_by_pose=csr_array((3 * k, 6 * len(path))),
-        on_path=np.full((k, 2), -1, dtype=np.int64),
-        fraction=np.zeros(k),
-        from_line=np.zeros((k, 3)),
+        on_path=AntennaPlaces.nowhere(k),
     )

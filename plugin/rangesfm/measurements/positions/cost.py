@@ -84,16 +84,12 @@ class AntennaPositions(Measurements):
             known: in the unscaled model. rows: (k,) of the antenna's that take part.
             stddev_m: (k,) standard deviations of a coordinate. site_from_model: the estimate. track: of the antenna.
         """
-        trajectory, arm_m = at.trajectory, np.array(track.antenna_in_cam_m, np.float64)
-        (before, after), fraction = known.on_path[rows].T, known.fraction[rows]
-        turned = trajectory.world_from_cam @ arm_m
-        on_line = (1 - fraction)[:, None] * turned[before] + fraction[:, None] * turned[after]
-        beyond = site_from_model.scale * known.from_line[rows] + known.arms_m[rows] - on_line
-        times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
+        arm_m, of_camera = np.array(track.antenna_in_cam_m, np.float64), known.on_path.subset(rows)
+        arms_in_cam_m = np.tile(arm_m, (len(rows), 1))
         stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
         return cls(
             tuple(known.names[row] for row in rows.tolist()),
-            AntennaPlaces(before, after, fraction, times[after] - times[before], beyond @ site_from_model.rotation.T),
+            of_camera.on_map(at.trajectory, arms_in_cam_m, known.arms_m[rows], site_from_model),
             known.position_m[rows],
             _whitenings(known.covariance_m2[rows], stddev_m),
             stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / stddev_m, 0.0),

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Mask
+from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.util.geometry.similarity import Similarity
 
 LASTING_S = (3.0, 30.0, 300.0)
@@ -45,8 +46,7 @@ class KnownPositions:
         world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
         by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
             turn in its own frame and a shift, in the model's world and unit.
-        on_path: (k, 2) keyframes before and after; -1 for marks. fraction: (k,) of the later one.
-        from_line: (k, 3) deviation of the curved path from the straight line between them, in the model's unit.
+        on_path: places of the camera on its path; none for marks.
     """
 
     names: tuple[str, ...]
@@ -66,9 +66,7 @@ class KnownPositions:
     world_from_cam: Array
     by_pose: csr_array
     arms_by_pose: csr_array
-    on_path: Indices
-    fraction: Array
-    from_line: Array
+    on_path: AntennaPlaces
 
     def __len__(self) -> int:
         return len(self.names)
@@ -77,7 +75,7 @@ class KnownPositions:
         """Return these positions followed by others in the same model."""
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in _ARRAYS}
         both |= {name: vstack([getattr(self, name), getattr(others, name)], format="csr") for name in _SPARSE}
-        return KnownPositions(names=self.names + others.names, **both)
+        return KnownPositions(self.names + others.names, **both, on_path=self.on_path.joined(others.on_path))
 
     def predicted_m(self, site_from_model: Similarity) -> Array:
         """Return the (k, 3) positions in the site."""
@@ -89,4 +87,4 @@ class KnownPositions:
 
 
 _SPARSE = ("by_pose", "arms_by_pose")
-_ARRAYS = tuple(field.name for field in fields(KnownPositions) if field.name not in ("names", *_SPARSE))
+_ARRAYS = tuple(field.name for field in fields(KnownPositions) if field.name not in ("names", "on_path", *_SPARSE))

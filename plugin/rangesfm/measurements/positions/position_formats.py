@@ -164,7 +164,7 @@ def _log_of_table(
     if "quality" in names:
         is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
     position[is_lost] = np.nan
-    image_name = None if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
+    image_name = [] if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
     log = PositionLog.in_time_order(
         path,
         "table",

@@ -52,7 +52,7 @@ class PositionLog:
         position_m: (n, 3) in the site's frame, or in ``crs`` as they were read.
         covariance_m2: (n, 3, 3) in the axes east, north, up or x, y, z; NaN where the file does not give it.
         timestamp_s: (n,) on the system's clock, rising; or None.
-        image_name: names of the n photos; or None.
+        image_name: names of the n photos; empty for positions by time.
         line: (n,) lines in the file.
         path: the file, for messages. format: name of its format.
         crs: coordinate system of the positions as they were read; empty if neither their format nor the user says it.
@@ -62,7 +62,7 @@ class PositionLog:
     position_m: Array
     covariance_m2: Array
     timestamp_s: Array | None
-    image_name: tuple[str, ...] | None
+    image_name: tuple[str, ...]
     line: Indices
     path: Path | None = None
     format: str = "table"
@@ -85,7 +85,7 @@ class PositionLog:
         *,
         covariance_m2: Array,
         times_s: Array | None = None,
-        image_name: Sequence[str] | None = None,
+        image_name: Sequence[str] = (),
         notes: Sequence[str] = (),
     ) -> PositionLog:
         """Make a log in the order of time, without rows that have no position or the time of an earlier one.
@@ -112,7 +112,7 @@ class PositionLog:
             position_m[rows],
             covariance_m2[rows],
             None if times_s is None else times_s[rows],
-            None if image_name is None else tuple(image_name[row] for row in rows.tolist()),
+            tuple(image_name[row] for row in rows.tolist()) if image_name else (),
             np.asarray(line, dtype=np.int64)[rows],
             path,
             format,

@@ -21,7 +21,6 @@ from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
-from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.robust_statistics import RobustLoss
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -285,11 +284,9 @@ def antenna_places(
     tags_in_cam_m, times = observations.log.lever_arms(tag_in_cam_m), trajectory.timestamps_s
     before, after = observations.before, observations.after
     interval_s = np.zeros(len(before)) if times is None else times[after] - times[before]
-    on_line = AntennaPlaces(before, after, observations.fraction, interval_s, np.zeros((len(before), 3)))
-    unmoved = Poses(trajectory.world_from_cam, np.zeros_like(trajectory.centers))
-    from_center_m = on_line.at(unmoved, tags_in_cam_m[observations.log.tag_index])
-    beyond_m = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - from_center_m
-    return replace(on_line, offset_m=beyond_m @ metric_from_sfm.rotation.T), tags_in_cam_m
+    of_camera = AntennaPlaces(before, after, observations.fraction, interval_s, observations.center_offsets)
+    arms_in_cam_m, arms_m = tags_in_cam_m[observations.log.tag_index], observations.tag_from_center
+    return of_camera.on_map(trajectory, arms_in_cam_m, arms_m, metric_from_sfm), tags_in_cam_m
 
 
 def anchors_at(anchors: Sequence[AnchorEstimate], blocks: Mapping[Block, Array]) -> tuple[AnchorEstimate, ...]:
