@@ -65,7 +65,7 @@ def test_scale_and_ranges_are_those_of_the_delivered_map(lap: MadeSurvey, refine
         lap.tag_in_cam_m,
         refined.anchors,
     )
-    assert refined.predicted_m == pytest.approx(predicted_m, abs=1e-6, nan_ok=True)
+    assert refined.ranges.predicted_m == pytest.approx(predicted_m, abs=1e-6, nan_ok=True)
 
 
 def test_keyframes_err_as_their_covariances_say(lap: MadeSurvey, refined: MetricResult) -> None:

@@ -14,7 +14,7 @@ from tests.known import known
 
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
+from rangesfm.diagnostics.finished_map import doubts_of_points, place_of_map
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.options import ScaleOptions
@@ -56,7 +56,7 @@ def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Trajectory:
 def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: MakeSurvey, seed: int) -> None:
     walked = make_survey(num_epochs=4, radio=RADIO, seed=seed)
     estimate = walked.scale("site", tuple(walked.anchors_m), options=OPTIONS)
-    assert list(doubts_of_map(None, GOOD_POINTS)) == []
+    assert doubts_of_points(GOOD_POINTS) == ()
     place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
     assert place.verdict == "good"
     off_m = path_in_site(walked, estimate).centers - walked.centers_m
@@ -65,7 +65,7 @@ def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: Ma
 
 
 def test_points_that_are_not_of_the_photos_are_said_of_the_place_too(walked: Survey, estimate: ScaleEstimate) -> None:
-    (doubt,) = doubts_of_map(None, PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8))
+    (doubt,) = doubts_of_points(PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8))
     assert doubt.reason.startswith("the map's points lie 82 px (median) from where the photos show them")
     assert doubt.advice
     place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [doubt.reason], NOT_BENT))

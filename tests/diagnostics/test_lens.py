@@ -13,7 +13,8 @@ import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
-from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
+from rangesfm.diagnostics.lens import fit_lens
+from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -65,7 +66,7 @@ def test_pixels_that_are_no_squares_are_named_with_a_camera_model_that_has_them(
 def test_nothing_is_said_of_a_lens_that_fits(seed: int) -> None:
     fit = fit_lens(walk(seed))
     assert fit is not None
-    assert doubt_of_lens(fit, 1.0, 0.0) is None
+    assert fit.doubts(1.0, 0.0) == ()
 
 
 def test_nothing_is_said_of_a_lens_whose_misfit_changes_lengths_by_less_than_the_interval() -> None:
@@ -73,5 +74,5 @@ def test_nothing_is_said_of_a_lens_whose_misfit_changes_lengths_by_less_than_the
     photograph_with_low_pixels(model, "SIMPLE_RADIAL", 0.9)
     fit = fit_lens(model)
     assert fit is not None
-    assert doubt_of_lens(fit, None, 0.02) is not None
-    assert doubt_of_lens(replace(fit, change_95=0.01), None, 0.02) is None
+    assert fit.doubts(LARGEST_FACTOR, 0.02)
+    assert replace(fit, change_95=0.01).doubts(LARGEST_FACTOR, 0.02) == ()

@@ -95,7 +95,7 @@ def test_a_single_point_is_tested_and_no_point_is_none(marked: Marked) -> None:
     placed = Placed(1e-6 * np.eye(7), np.array(SITE_M), 0.0)
     found = diagnose_points(ControlPoints((alone,), marked.markers), marked.model, None, 0.0, placed)
     assert [test.rejected for test in found.tests] == [True]
-    assert found.tests[0].effect_on_scale is None
+    assert np.isnan(found.tests[0].effect_on_scale)
     unseen = ControlPoints((ControlPoint("elsewhere", np.zeros(3), STDDEV_M, "check", 2),))
     assert diagnose_points(unseen, marked.model, None, 0.0, placed).tests == ()
 

@@ -196,16 +196,16 @@ class TestWithoutNoise:
         refined, summary = survey.refine(survey.anchors(stddev_m), scale_error)
         assert summary.converged
         np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-6)
-        for anchor in summary.anchors:
+        for anchor in summary.ranges.anchors:
             np.testing.assert_allclose(anchor.position_m, survey.anchors_m[anchor.anchor_id], atol=1e-5)
         assert summary.final_cost < 1e-9
         assert summary.reprojection_rms_px < 1e-4
-        np.testing.assert_allclose(summary.predicted_m, survey.observations.log.range_m, atol=1e-6)
+        np.testing.assert_allclose(summary.ranges.predicted_m, survey.observations.log.range_m, atol=1e-6)
 
     def test_a_bias_within_its_prior_is_found(self) -> None:
         survey = make_survey(radio=Radio(range_bias_m={"A": 0.2, "C": -0.1}), num_epochs=4)
         refined, summary = survey.refine(survey.anchors(0.0, bias_stddev_m=1.0))
-        biases = {anchor.anchor_id: anchor.range_bias_m for anchor in summary.anchors}
+        biases = {anchor.anchor_id: anchor.range_bias_m for anchor in summary.ranges.anchors}
         assert biases == pytest.approx({"A": 0.2, "B": 0.0, "C": -0.1, "D": 0.0}, abs=0.005)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
 
@@ -215,9 +215,9 @@ class TestWithoutNoise:
             known_errors(survey.observations, RANGE_STDDEV_M, common_bias_stddev_m=stddev_m) for stddev_m in (0.1, 0.0)
         ]
         _, summary = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), errors=errors[0])
-        np.testing.assert_allclose([anchor.range_bias_m for anchor in summary.anchors], 0.08, atol=0.005)
+        np.testing.assert_allclose([anchor.range_bias_m for anchor in summary.ranges.anchors], 0.08, atol=0.005)
         _, apart = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), errors=errors[1])
-        assert all(abs(anchor.range_bias_m) < 0.04 for anchor in apart.anchors)
+        assert all(abs(anchor.range_bias_m) < 0.04 for anchor in apart.ranges.anchors)
 
     def test_ranges_between_keyframes_count_as_well(self) -> None:
         survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=5.0), at_keyframes=False)
@@ -250,7 +250,7 @@ class TestWithoutNoise:
         refined, summary = survey.refine(survey.anchors(0.0), 1.05, observations=observations, tag_in_cam_m=tags)
         np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-2)
         placed = observations.has_place
-        np.testing.assert_allclose(summary.predicted_m[placed], log.range_m[placed], atol=1e-2)
+        np.testing.assert_allclose(summary.ranges.predicted_m[placed], log.range_m[placed], atol=1e-2)
         with pytest.raises(InputError, match=r"expected \(3,\) or \(2, 3\)"):
             survey.refine(survey.anchors(0.0), observations=observations, tag_in_cam_m=np.zeros((3, 3)))
 
@@ -303,7 +303,7 @@ class TestWhatIsKnownStays:
     def test_anchors_without_uncertainty(self) -> None:
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
         _, summary = survey.refine(survey.anchors(0.0), 1.05)
-        for anchor in summary.anchors:
+        for anchor in summary.ranges.anchors:
             np.testing.assert_array_equal(anchor.position_m, survey.anchors_m[anchor.anchor_id])
 
     def test_surveyed_anchors_move_by_no_more_than_they_may(self) -> None:
@@ -321,8 +321,8 @@ class TestWhatIsKnownStays:
                 prior_position_stddev_m=stddev_m,
             )
             _, summary = survey.refine([first, *others])
-            moved[stddev_m] = float(np.linalg.norm(summary.anchors[0].position_m - wrong))
-            for anchor in summary.anchors[1:]:
+            moved[stddev_m] = float(np.linalg.norm(summary.ranges.anchors[0].position_m - wrong))
+            for anchor in summary.ranges.anchors[1:]:
                 assert np.linalg.norm(anchor.position_m - survey.anchors_m[anchor.anchor_id]) < 0.003
         assert moved[0.001] < 0.003
         assert moved[1.0] == pytest.approx(0.2, abs=0.02)
@@ -395,7 +395,7 @@ class TestDistances:
         assert summary.converged
         assert survey.scale_error(stiff) > 0.02
         assert abs(survey.scale_error(free)) < 0.01
-        residuals_m = summary.predicted_m - told["observations"].log.range_m
+        residuals_m = summary.ranges.predicted_m - told["observations"].log.range_m
         assert np.median(np.abs(residuals_m)) < 2 * RANGE_STDDEV_M
         covariance = known(summary.covariance)
         assert 0.005 < covariance.scale_stddev < 0.02
@@ -429,8 +429,8 @@ class TestDistances:
         for name, taken in {"with": observations, "without": without}.items():
             errors = known_errors(taken, 0.3, common_bias_stddev_m=0.05)
             _, summary = survey.refine(survey.anchors(np.inf), observations=taken, errors=errors)
-            places = np.array([anchor.position_m for anchor in summary.anchors])
-            truth = np.array([survey.anchors_m[anchor.anchor_id] for anchor in summary.anchors])
+            places = np.array([anchor.position_m for anchor in summary.ranges.anchors])
+            truth = np.array([survey.anchors_m[anchor.anchor_id] for anchor in summary.ranges.anchors])
             lengths = [[np.linalg.norm(a - b) for a, b in itertools.combinations(at, 2)] for at in (places, truth)]
             off_m[name] = rmse(np.diff(lengths, axis=0).T)
         assert off_m["with"] < 0.5 * off_m["without"]
@@ -447,7 +447,7 @@ class TestDistances:
         ):
             errors = known_errors(taken, RANGE_STDDEV_M, common_bias_stddev_m=0.05)
             _, summary = survey.refine(survey.anchors(np.inf), observations=taken, errors=errors)
-            places.append(np.array([anchor.position_m for anchor in summary.anchors]))
+            places.append(np.array([anchor.position_m for anchor in summary.ranges.anchors]))
         assert rmse(places[1] - places[0]) < 0.001
 
 
@@ -466,9 +466,9 @@ class TestWithNoise:
         survey = make_survey(pixel_stddev=0.5, radio=radio, num_epochs=3)
         refined, summary = survey.refine(survey.anchors(0.0), errors=0.03)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.03
-        off = np.abs(summary.predicted_m - survey.observations.log.range_m)
-        assert np.all(summary.observations.status[off > 0.5] == RangeStatus.OUTLIER)
-        assert np.all(summary.observations.status[off < 0.05] == RangeStatus.USED)
+        off = np.abs(summary.ranges.predicted_m - survey.observations.log.range_m)
+        assert np.all(summary.ranges.observations.status[off > 0.5] == RangeStatus.OUTLIER)
+        assert np.all(summary.ranges.observations.status[off < 0.05] == RangeStatus.USED)
         assert np.mean(off > 0.5) > 0.1
 
     def test_long_ranges_that_the_scale_sets_aside_the_refinement_sets_aside_too(self) -> None:
@@ -554,10 +554,10 @@ class TestBesideTheMap:
         if not at_keyframes:  # as the scale stage passes them on: with the stddev of each place
             given["errors"] = np.hypot(0.01, placed.placing_stddev_m(survey.metric_from_sfm.scale))
         bent, held = survey.refine(survey.anchors(0.0), **given)
-        np.testing.assert_array_equal(held.tags_in_cam_m, [wrong])
+        np.testing.assert_array_equal(held.ranges.tags_in_cam_m, [wrong])
         options = RefineOptions(lever_arm_stddev_m=0.1)
         refined, summary = survey.refine(survey.anchors(0.0), options=options, **given)
-        np.testing.assert_allclose(summary.tags_in_cam_m, [TAG_IN_CAM_M], atol=0.015)
+        np.testing.assert_allclose(summary.ranges.tags_in_cam_m, [TAG_IN_CAM_M], atol=0.015)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
 
@@ -567,18 +567,18 @@ class TestBesideTheMap:
         placed = associate(survey.observations.log, survey.trajectory, wrong)
         options = RefineOptions(lever_arm_stddev_m=1e-4)
         _, summary = survey.refine(survey.anchors(0.0), observations=placed, tag_in_cam_m=wrong, options=options)
-        np.testing.assert_allclose(summary.tags_in_cam_m, [wrong], atol=1e-3)
-        assert (summary.tags_in_cam_m != wrong).any()
+        np.testing.assert_allclose(summary.ranges.tags_in_cam_m, [wrong], atol=1e-3)
+        assert (summary.ranges.tags_in_cam_m != wrong).any()
 
     def test_a_wrong_clock_offset_is_put_right(self) -> None:
         # At an even speed around a loop, a late clock cannot be distinguished from a map that is turned back.
         survey = self.survey(path=loop_path(20.0, unsteadiness_m=1.0, seed=3), num_keyframes=81)
         late = associate(survey.observations.log, survey.trajectory, TAG_IN_CAM_M, time_offset_s=-0.1)
         bent, held = survey.refine(survey.anchors(0.0), observations=late, errors=0.03)
-        assert held.time_shift_s is None
+        assert held.ranges.time_shift_s is None
         options = RefineOptions(time_offset_stddev_s=0.1)
         refined, summary = survey.refine(survey.anchors(0.0), observations=late, errors=0.03, options=options)
-        assert summary.time_shift_s == pytest.approx(0.1, abs=0.01)
+        assert summary.ranges.time_shift_s == pytest.approx(0.1, abs=0.01)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
 
@@ -591,10 +591,10 @@ class TestBesideTheMap:
         observations = replace(survey.observations, log=replace(log, range_m=log.range_m + short))
         stddev = np.hypot(0.03, shared_stddev(observations.log))
         _, held = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev)
-        assert held.short_range_error_m is None
+        assert held.ranges.short_range_error_m is None
         options = RefineOptions(short_range_stddev_m=0.3)
         _, summary = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev, options=options)
-        assert summary.short_range_error_m == pytest.approx(-0.3, abs=0.05)
+        assert summary.ranges.short_range_error_m == pytest.approx(-0.3, abs=0.05)
 
 
 class TestCovariance:
@@ -613,9 +613,9 @@ class TestCovariance:
     def test_anchors_have_the_stddevs_of_the_joint_problem(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
         _, free = survey.refine(survey.anchors(np.inf))
-        assert all(0.01 < anchor.position_stddev_m < 2.0 for anchor in free.anchors)
+        assert all(0.01 < anchor.position_stddev_m < 2.0 for anchor in free.ranges.anchors)
         _, held = survey.refine(survey.anchors(0.0))
-        assert all(anchor.position_stddev_m == 0.0 for anchor in held.anchors)
+        assert all(anchor.position_stddev_m == 0.0 for anchor in held.ranges.anchors)
 
     def test_none_is_found_where_none_is_wanted(self) -> None:
         survey = make_survey(pixel_stddev=0.5)
@@ -638,7 +638,7 @@ class TestProblem:
         placed = survey.observations.has_place
         residuals = np.asarray(adjusters[-1].problem.evaluate_residuals())[-np.count_nonzero(placed) :]
         unit = 3.0 * RANGE_STDDEV_M / summary.pixel_stddev
-        expected = (summary.predicted_m - survey.observations.log.range_m)[placed]
+        expected = (summary.ranges.predicted_m - survey.observations.log.range_m)[placed]
         # The problem keeps the residuals of one place and anchor together.
         at = survey.observations
         expected = expected[np.lexsort([at.log.anchor_index[placed], at.after[placed], at.before[placed]])]

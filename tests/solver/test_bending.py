@@ -96,7 +96,7 @@ def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(
     path: Trajectory, frame_is_free: bool, loose: list[int]
 ) -> None:
     is_firm = ~np.isin(np.arange(NUM_POSES), loose)
-    functions = without_similarity(slopes(path), path, frame_is_free=frame_is_free, is_firm=is_firm)
+    functions = without_similarity(slopes(path), path, is_firm, frame_is_free=frame_is_free)
     turn, shift, growth = np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.4, -0.3]), 0.2
     moves = np.zeros((NUM_POSES, 6))
     moves[:, :3] = np.swapaxes(path.world_from_cam, 1, 2) @ turn

@@ -450,11 +450,11 @@ def told(
     tests = run_.diagnosis.tests
     causes = [f"{c.name} {c.subject}".strip() for c in run_.diagnosis.causes]
     rejected = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected]
-    of_evidence = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None]
+    of_evidence = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected and not np.isfinite(t.stddev)]
     named = [name for name in dict.fromkeys([*rejected, *causes]) if name in causes or name in of_evidence]
     # A test named before the causes is what the survey's first sentence says.
     first = named[:1] if named and f"{tests[0].name} {tests[0].subject}".strip() not in causes else causes
-    effects = [(t.effect_on_scale, f"{t.name} {t.subject}".strip()) for t in tests if t.effect_on_scale is not None]
+    effects = [(t.effect_on_scale, f"{t.name} {t.subject}".strip()) for t in tests if np.isfinite(t.effect_on_scale)]
     return {
         **line,
         "refused": "",
@@ -468,7 +468,11 @@ def told(
         "half_width": run_.estimate.uncertainty.half_width_95,
         "log_error": float(np.log(run_.estimate.value / run_.survey.metres_per_unit)),
         "hidden": max(effects, default=None),
-        "smallest": {f"{t.name} {t.subject}".strip(): t.smallest_detectable for t in tests} if kind == CLEAN else None,
+        "smallest": {
+            f"{t.name} {t.subject}".strip(): t.smallest_detectable
+            for t in tests
+            if kind == CLEAN and np.isfinite(t.smallest_detectable)
+        },
     }
 
 

@@ -13,6 +13,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -47,9 +48,7 @@ class ModelRanges:
         if len(timed) == 0 or len(self.log) == 0:
             return np.zeros(0)
         at = associate(self.log, timed, tags, options=self.association)
-        index = self.log.anchor_index
-        predicted = np.linalg.norm(at.centers + at.tag_from_center - anchors[index], axis=1) + biases[index]
-        return np.asarray((predicted - self.log.range_m)[at.has_place])
+        return np.asarray((at.predicted_m(IDENTITY, anchors, biases) - self.log.range_m)[at.has_place])
 
 
 def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRanges | None:

@@ -16,9 +16,9 @@ from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.diagnostics.place import Place, by_similarity, place_in_words
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.with_ranges import RefineSummary
+from rangesfm.estimation.with_ranges import RefinedRanges, RefineSummary
 from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -36,18 +36,17 @@ _MAX_RESIDUAL_GROWTH = 2.0
 _LOOSE = 10.0
 
 
-def doubts_of_map(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
-    """Yield doubts about points that do not fit the photos, and about the refinement.
+def doubts_of_points(points: PointErrors) -> tuple[Doubt, ...]:
+    """Return a doubt if the points of a map do not fit the photos."""
+    return () if points.fit else (Doubt(points.apart("the map"), MISMATCHED),)
 
-    Args:
-        summary: of the refinement; None for a map that is only scaled. points: of the final model.
-    """
-    if not points.fit:
-        yield Doubt(points.apart("the map"), MISMATCHED)
-    if summary is not None and not summary.converged:
+
+def doubts_of_refinement(summary: RefineSummary) -> Iterator[Doubt]:
+    """Yield doubts about a refinement."""
+    if not summary.converged:
         remedy = "allow more iterations ([refine] max_num_iterations), or remove wrong points from the map"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
-    for misfit in () if summary is None else summary.misfits:
+    for misfit in summary.misfits:
         yield Doubt(f"after the refinement {misfit.reason}", misfit.advice)
 
 
@@ -70,7 +69,7 @@ def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Dou
 
 def place_of_map(
     estimate: ScaleEstimate,
-    summary: RefineSummary | None,
+    errors: MapErrors | None,
     path: Trajectory,
     doubts: Sequence[str],
     bent_by_m: Array,
@@ -78,20 +77,20 @@ def place_of_map(
     """Return the map's place in the site's frame with its uncertainty; None if the frame is the first camera's.
 
     Args:
-        summary: of the refinement; None for a map that is only scaled.
+        errors: of the refined map; None for a map that is only scaled, or where they are not known.
         path: of the n keyframes in the final map, the first in time first.
         doubts: about the map, in words; with any of them its place is doubtful too.
         bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
     """
     if estimate.placement is None:
         return None
-    found, centers_m = None if summary is None else summary.covariance, path.centers
+    centers_m = path.centers
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
-    if found is not None:
-        of_keyframes = found.centers_m2(path.frame_ids)
+    if errors is not None:
+        of_keyframes = errors.centers_m2(path.frame_ids)
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
-    bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
+    bent_m2 = np.square(bent_by_m) if errors is None and len(bent_by_m) else 0.0
     keyframes_m = np.sqrt(keyframes_m2 + bent_m2)
     worst_m = float(keyframes_m.max())
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
@@ -142,7 +141,7 @@ def why_broken(
     return (
         *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
         *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0)),
-        *_apart_from_ranges(estimate, summary, old),
+        *_apart_from_ranges(estimate, summary.ranges, old),
     )
 
 
@@ -152,7 +151,7 @@ def _max_growth(scaled: pycolmap.Reconstruction, summary: RefineSummary, range_l
     The solver only reduces the cost, and the loss of a range is bounded by half the square of its scale c. So n ranges
     can outweigh at most n c^2 in squared pixel standard deviations, spread over the 2 N coordinates of N observations.
     """
-    num_ranges = int(np.count_nonzero(summary.observations.status <= RangeStatus.OUTLIER))
+    num_ranges = int(np.count_nonzero(summary.ranges.observations.has_place))
     num_coordinates = 2 * max(scaled.compute_num_observations(), 1)
     return _OF_MEDIANS * float(np.sqrt(1 + num_ranges * range_loss_scale**2 / num_coordinates))
 
@@ -183,14 +182,14 @@ def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
         yield f"the points moved away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
 
 
-def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
+def _apart_from_ranges(estimate: ScaleEstimate, ranges: RefinedRanges, path_m: Array) -> Iterator[str]:
     """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
     if np.isfinite(old_m := estimate.ranges.median_off_m):
-        new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
+        new_m = float(np.nanmedian(np.abs(ranges.predicted_m - ranges.observations.log.range_m)))
         if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
             yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"
     size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
-    for anchor in summary.anchors:
+    for anchor in ranges.anchors:
         if anchor.prior_position_m is not None and np.isfinite(anchor.prior_position_stddev_m):
             far_m = float(np.linalg.norm(anchor.position_m - anchor.prior_position_m))
             if far_m > max(size_m, 10 * anchor.prior_position_stddev_m):

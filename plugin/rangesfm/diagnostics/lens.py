@@ -64,17 +64,33 @@ class LensFit:
     num_params: int
     change_95: float
 
-    def is_by_chance(self, bending_factor: float) -> bool:
-        """Return whether so much may be gained with a lens that fits.
+    def doubts(self, bending_factor: float, half_width_95: float) -> tuple[Doubt, ...]:
+        """Return a doubt if the lens does not fit, and lengths are wrong by more than a good map's because of it.
+
+        They are if they change by more than the scale's interval, or by more than any good scale's.
 
         Errors of real features are alike in neighbouring photos, so that they bend a map by a multiple of what
         independent errors would. The gain grows with its square: with the true lens of Strecha's fountain it is 10 to
-        13 times what independent errors give.
+        13 times what independent errors give. So much may be gained with a lens that fits.
 
         Args:
-            bending_factor: that multiple.
+            bending_factor: that multiple, as the refinement has learnt it.
+            half_width_95: of the scale's interval, relative.
         """
-        return bool(self.gain < bending_factor**2 * special.chdtri(self.num_params, RISK))
+        factor = float(np.clip(bending_factor, MEDIAN_FACTOR, LARGEST_FACTOR))
+        is_by_chance = self.gain < factor**2 * special.chdtri(self.num_params, RISK)
+        if is_by_chance or self.change_95 <= min(half_width_95, DOUBTFUL_ABOVE):
+            return ()
+        is_richer = self.models != self.richer_models
+        other = self.richer_models if is_richer else "other parameters"
+        reason = (
+            f"the lens is not as the camera model {self.models} has it: with {other}, the map fits the photos to "
+            f"{self.richer_error_px:.2f} px instead of {self.error_px:.2f} px, and lengths in it change by up to "
+            f"{100 * self.change_95:.1f} %"
+        )
+        calibrate = "calibrate the camera and give model and params in [camera]"
+        again = f"map the photos again with --camera_model {self.richer_models}, or " if is_richer else ""
+        return (Doubt(reason, again + calibrate),)
 
 
 def fit_lens(model: pycolmap.Reconstruction, least_change: float = 0.0) -> LensFit | None:
@@ -106,30 +122,6 @@ def fit_lens(model: pycolmap.Reconstruction, least_change: float = 0.0) -> LensF
         num_params=num_params,
         change_95=_change_of_lengths(own, richer),
     )
-
-
-def doubt_of_lens(fit: LensFit | None, bending_factor: float | None, half_width_95: float) -> Doubt | None:
-    """Return a doubt if the lens does not fit, and lengths are wrong by more than a good map's because of it.
-
-    They are if they change by more than the scale's interval, or by more than any good scale's.
-
-    Args:
-        bending_factor: learnt by the refinement; None: unknown.
-        half_width_95: of the scale's interval, relative.
-    """
-    factor = LARGEST_FACTOR if bending_factor is None else float(np.clip(bending_factor, MEDIAN_FACTOR, LARGEST_FACTOR))
-    if fit is None or fit.is_by_chance(factor) or fit.change_95 <= min(half_width_95, DOUBTFUL_ABOVE):
-        return None
-    is_richer = fit.models != fit.richer_models
-    other = fit.richer_models if is_richer else "other parameters"
-    reason = (
-        f"the lens is not as the camera model {fit.models} has it: with {other}, the map fits the photos to "
-        f"{fit.richer_error_px:.2f} px instead of {fit.error_px:.2f} px, and lengths in it change by up to "
-        f"{100 * fit.change_95:.1f} %"
-    )
-    calibrate = "calibrate the camera and give model and params in [camera]"
-    again = f"map the photos again with --camera_model {fit.richer_models}, or " if is_richer else ""
-    return Doubt(reason, again + calibrate)
 
 
 def _enrich(camera: pycolmap.Camera) -> None:

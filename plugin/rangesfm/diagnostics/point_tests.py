@@ -121,4 +121,4 @@ def _row(point: ControlPoint | None, found: EstimatedMistake, threshold: float) 
         return replace(row_of_mistake(_ALL, "", found, threshold, words, _ONE_FRAME), effect_on_scale=0.0)
     words = f"the map has the {point.kind} point {point.name} {far.format('its coordinates')}"
     row = row_of_mistake(f"{point.kind} point in the map", point.name, found, threshold, words, LOOK_AGAIN)
-    return replace(row, effect_on_scale=0.0 if point.kind == CHECK else None)
+    return replace(row, effect_on_scale=0.0 if point.kind == CHECK else np.nan)

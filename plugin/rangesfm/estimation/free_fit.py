@@ -111,7 +111,8 @@ class GraphBending:
     path: Trajectory
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
-        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
+        is_firm = np.ones(len(self.path), dtype=bool)
+        functions = without_similarity(by_pose, self.path, is_firm, frame_is_free=frame_is_free)
         parts = functions.reshape(len(by_pose), -1, 6)
         parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
         covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))

@@ -37,6 +37,7 @@ class MapProblem:
         left_out_ids: 3-D points that do not take part.
         visible_m: movement of a camera that moves a feature by its standard deviation. It says what matters in a map
             without measurements, in the unit of the map.
+        predicted: measurements of which none takes part, so that they are only predicted.
     """
 
     metric: pycolmap.Reconstruction
@@ -50,6 +51,7 @@ class MapProblem:
     marker_ids: Mapping[str, int] = field(default_factory=dict)
     left_out_ids: frozenset[int] = frozenset()
     visible_m: float = 0.0
+    predicted: tuple[Measurements, ...] = ()
 
     @property
     def frame_ids(self) -> Indices:
@@ -60,6 +62,11 @@ class MapProblem:
     def markers(self) -> Mapping[str, Marker]:
         """Marks in photos to which the measurements refer, by name."""
         return {name: marker for kind in self.kinds for name, marker in kind.markers.items()}
+
+    @property
+    def measured(self) -> tuple[Measurements, ...]:
+        """All measurements, also those that are only predicted."""
+        return (*self.kinds, *self.predicted)
 
     @property
     def held_frame(self) -> int:
@@ -171,15 +178,17 @@ def map_problem(
     """
     if options.time_offset_stddev_s and trajectory.timestamps_s is None:
         raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
+    used = [kind for kind in kinds if kind.takes_part]
     return MapProblem(
         metric,
-        (*kinds, *(prior for kind in kinds for prior in kind.priors())),
+        (*used, *(prior for kind in used for prior in kind.priors())),
         trajectory.frame_ids,
         camera,
         options,
         first_pose_is_fixed,
         num_threads,
         is_refined,
+        predicted=tuple(kind for kind in kinds if not kind.takes_part),
     )
 
 

@@ -85,11 +85,11 @@ class PhotoBending:
 
     def shape_by_steps(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         """Return the derivatives (n, c) by the photos' steps of functions without those by scale and place."""
-        return self._by_steps(without_similarity(by_pose, self.path, frame_is_free=frame_is_free, is_firm=self.is_firm))
+        return self._by_steps(without_similarity(by_pose, self.path, self.is_firm, frame_is_free=frame_is_free))
 
     def similarity_by_steps(self, *, frame_is_free: bool) -> Array:
         """Return the derivatives (n, 7) by the photos' steps of the map as a whole, about the path's first pose."""
-        of_path = self._by_steps(similarity_of(self.path, frame_is_free=frame_is_free, is_firm=self.is_firm))
+        of_path = self._by_steps(similarity_of(self.path, self.is_firm, frame_is_free=frame_is_free))
         turned = of_path[:, 1:].reshape(-1, 2, 3) @ self.world_from_model.T
         turned[:, 1] *= self.metres_per_unit
         return np.hstack([of_path[:, :1], turned.reshape(-1, 6)])

@@ -9,23 +9,23 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
 from rangesfm.measurements.gravity import UpwardDirection
-from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.kind import Doubt, MapState
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, misfits
+from rangesfm.measurements.ranges.cost import CLOCK, SHORT, anchors_at
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
 
@@ -99,7 +99,33 @@ def refine_with_ranges(
         )
         rest = refine(problem)
         covariance = joint_errors(rest, 1.0) if options.covariance else None
-    return metric, summarize(rest, ranges, covariance, 1.0)
+    return metric, summarize(rest, covariance, 1.0)
+
+
+@dataclass(frozen=True)
+class RefinedRanges:
+    """The n ranges of a log as a refined map has them.
+
+    Attributes:
+        observations: with status by the final weight of each range.
+        errors: of all ranges, as weighted at the end.
+        anchors: refined positions and biases, with standard deviations if there is a covariance.
+        predicted_m: (n,) ranges predicted by the map; NaN without a place.
+        weights: (n,) robust weights in [0, 1]; NaN without a place.
+        tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
+        time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
+        short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
+            estimated.
+    """
+
+    observations: RangeObservations
+    errors: RangeErrors
+    anchors: tuple[AnchorEstimate, ...]
+    predicted_m: Array
+    weights: Array
+    tags_in_cam_m: Array
+    time_shift_s: float | None
+    short_range_error_m: float | None
 
 
 @dataclass(frozen=True)
@@ -114,23 +140,14 @@ class RefineSummary:
             that time, and at the end.
         reprojection_rms_px: root mean square length of the final reprojection errors.
         pixel_stddev: standard deviation of a feature's coordinate, from the residuals before.
-        errors: of all n ranges of the log, as weighted at the end.
         seconds: time of the solver.
         converged: whether the keyframes came to rest.
         message: of the solver.
         misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
-        anchors: refined positions and biases, with standard deviations if there is a covariance.
-        tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
-        time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
-        short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
-            estimated.
+        ranges: as the refined map has them.
         covariance: how poses, cameras and anchors err together; None if not asked for, if the model is too large, or
-            if ranges and
-            photos leave something undetermined.
+            if ranges and photos leave something undetermined.
         bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
-        observations: with status by the final weight of each range.
-        predicted_m: (n,) ranges predicted by the refined model; NaN without a place.
-        weights: (n,) robust weights in [0, 1]; NaN without a place.
     """
 
     num_iterations: int
@@ -140,43 +157,17 @@ class RefineSummary:
     final_cost: float
     reprojection_rms_px: float
     pixel_stddev: float
-    errors: RangeErrors
     seconds: float
     converged: bool
     message: str
     misfits: tuple[Doubt, ...]
-    anchors: tuple[AnchorEstimate, ...]
-    tags_in_cam_m: Array
-    time_shift_s: float | None
-    short_range_error_m: float | None
+    ranges: RefinedRanges
     covariance: MapErrors | None
     bending_factor: float
-    observations: RangeObservations
-    predicted_m: Array
-    weights: Array
 
-    def moved(self, change: Similarity, anchors_m: Array, rows: Indices, longer_m: Array) -> RefineSummary:
-        """Return the summary of the same map moved as a whole.
-
-        Args:
-            change: from the world of this map to that of the moved one. anchors_m: (m, 3) positions of anchors there.
-            rows: (k,) ranges that took part. longer_m: (k,) by how much longer they are there.
-        """
-        predicted_m, weights, status = self.predicted_m.copy(), self.weights.copy(), self.observations.status.copy()
-        predicted_m[rows] += longer_m
-        weights[rows] = self.errors.subset(rows).robust_weights((predicted_m - self.observations.log.range_m)[rows])
-        status[rows] = status_by_weight(weights[rows])
-        mirrors_m = [
-            None if each.mirror_position_m is None else change.apply(each.mirror_position_m) for each in self.anchors
-        ]
-        places = zip(self.anchors, anchors_m, mirrors_m, strict=True)
-        return replace(
-            self,
-            anchors=tuple(replace(a, position_m=at_m, mirror_position_m=mirror_m) for a, at_m, mirror_m in places),
-            observations=replace(self.observations, status=status),
-            predicted_m=predicted_m,
-            weights=weights,
-        )
+    def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> RefineSummary:
+        """Return the summary with others of the anchors."""
+        return replace(self, ranges=replace(self.ranges, anchors=anchors))
 
     def __repr__(self) -> str:
         """Return what the refinement did on one line."""
@@ -184,46 +175,56 @@ class RefineSummary:
         return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
 
 
-def summarize(rest: MapAtRest, given: Ranges, covariance: MapErrors | None, bending_factor: float) -> RefineSummary:
+def summarize(rest: MapAtRest, covariance: MapErrors | None, bending_factor: float) -> RefineSummary:
     """Summarise a refinement.
 
     Args:
-        rest: the map at rest. given: all ranges of the log, which may be empty.
-        covariance, bending_factor: as in the summary.
+        rest: the map at rest. covariance, bending_factor: as in the summary.
     """
-    ranges = ranges_of(rest.problem.kinds, given)
-    state, solutions = rest.state, rest.solutions
-    if not len(ranges.rows):
-        state = replace(state, blocks={**ranges.blocks, **state.blocks})
-    observations, rows, errors = ranges.observations, ranges.rows, ranges.errors
-    log = observations.log
-    predicted_m = ranges.predicted_m(state)
-    residuals_m, weights, status = predicted_m - log.range_m, np.full(len(log), np.nan), observations.status.copy()
-    weights[rows] = errors.robust_weights(residuals_m[rows])
-    status[rows] = status_by_weight(weights[rows])
-    times = observations.before + observations.fraction if log.timestamp_s is None else log.timestamp_s
     return RefineSummary(
-        num_iterations=sum(solution.num_iterations for solution in solutions),
+        num_iterations=sum(solution.num_iterations for solution in rest.solutions),
         num_graph_steps=rest.num_graph_steps,
         bend_m=rest.bend_m,
-        initial_cost=solutions[0].initial_cost,
-        final_cost=solutions[-1].final_cost,
+        initial_cost=rest.solutions[0].initial_cost,
+        final_cost=rest.solutions[-1].final_cost,
         reprojection_rms_px=rest.reprojection_rms_px,
         pixel_stddev=rest.pixel_stddev,
-        errors=errors.spread(rows, len(log)),
-        seconds=sum(solution.seconds for solution in solutions),
+        seconds=sum(solution.seconds for solution in rest.solutions),
         converged=rest.converged,
-        message=solutions[-1].message,
-        misfits=misfits(errors, residuals_m[rows], times[rows]),
-        anchors=_with_stddevs(anchors_at(ranges.anchors, state.blocks), covariance),
+        message=rest.solutions[-1].message,
+        misfits=ranges_of(rest.problem.measured).misfits(rest.state),
+        ranges=refined_ranges(rest, rest.state, covariance),
+        covariance=covariance,
+        bending_factor=bending_factor,
+    )
+
+
+def refined_ranges(
+    rest: MapAtRest, state: MapState, covariance: MapErrors | None, moved: Similarity = IDENTITY
+) -> RefinedRanges:
+    """Return the ranges of a log as a map has them that was at rest.
+
+    Args:
+        rest: the map at rest. state: of the map. covariance: as in the summary.
+        moved: from the world of the map at rest to that of the map.
+    """
+    ranges = ranges_of(rest.problem.measured)
+    anchors = tuple(anchor.mirror_moved(moved) for anchor in ranges.anchors)
+    rows, log = ranges.rows, ranges.observations.log
+    state = replace(state, blocks={**ranges.blocks, **state.blocks})
+    predicted_m = ranges.predicted_m(state)
+    weights, status = np.full(len(log), np.nan), ranges.observations.status.copy()
+    weights[rows] = ranges.errors.robust_weights((predicted_m - log.range_m)[rows])
+    status[rows] = status_by_weight(weights[rows])
+    return RefinedRanges(
+        observations=replace(ranges.observations, status=status),
+        errors=ranges.errors.spread(rows, len(log)),
+        anchors=_with_stddevs(anchors_at(anchors, state.blocks), covariance),
+        predicted_m=predicted_m,
+        weights=weights,
         tags_in_cam_m=ranges.arms_m(state),
         time_shift_s=ranges.estimated(state, CLOCK),
         short_range_error_m=ranges.estimated(state, SHORT),
-        covariance=covariance,
-        bending_factor=bending_factor,
-        observations=replace(observations, status=status),
-        predicted_m=predicted_m,
-        weights=weights,
     )
 
 

@@ -16,12 +16,12 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.kind import Doubt, Measurements
+from rangesfm.measurements.kind import Block, Doubt, Measurements
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
-from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
@@ -216,13 +216,10 @@ class KindOnMap(Located):
         del on_map
         yield from ()
 
-    def moved_ranges(self, known: Posterior, bent: FrameSteps) -> Iterator[tuple[Array, Indices, Array]]:
-        """Yield what changes where the map is bent, and moved to the estimate of a posterior, if they are ranges.
-
-        These are (m, 3) positions of anchors, (k,) rows of ranges, and (k,) by how much longer they are predicted.
-        """
-        del known, bent
-        yield from ()
+    @property
+    def blocks(self) -> Mapping[Block, Array]:
+        """Where they are in the metric world, as anchors, by block."""
+        return {}
 
 
 _Kind = TypeVar("_Kind", bound=KindOnMap)
@@ -320,7 +317,7 @@ def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second:
     """Return the test that compares the scales from two kinds of measurement."""
     apart = float(np.log(first.value / second.value))
     stddev = float(np.hypot(first.stddev / first.value, second.stddev / second.value))
-    smallest = finite(float(np.sqrt(noncentrality(1))) * stddev)
+    smallest = float(np.sqrt(noncentrality(1))) * stddev
     return MistakeTest(
         f"{kind.kind} against {other.kind}",
         "",
@@ -331,7 +328,7 @@ def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second:
         remedy=f"{kind.remedy}, and {other.remedy}",
         unit="1",
         size=apart,
-        stddev=finite(stddev),
+        stddev=stddev,
         smallest_detectable=smallest,
         effect_on_scale=smallest,
     )

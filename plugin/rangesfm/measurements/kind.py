@@ -115,6 +115,11 @@ class Measurements(ABC):
         return False
 
     @property
+    def takes_part(self) -> bool:
+        """Whether any of them takes part in an estimate; otherwise they are only predicted."""
+        return True
+
+    @property
     def markers(self) -> Mapping[str, Marker]:
         """Marks in photos to which they refer, by name."""
         return {}

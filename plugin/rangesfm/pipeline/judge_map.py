@@ -10,10 +10,11 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
-from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
-from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
+from rangesfm.diagnostics.finished_map import doubts_of_points, doubts_of_refinement, place_of_map
+from rangesfm.diagnostics.lens import fit_lens
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.scale.scale_estimate import refuse_unknown
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.measurements.kind import Doubt
@@ -45,18 +46,16 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
             f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.refined.why_broken)}"
         )
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
-    refinement = None if metric.kept is None else metric.kept.summary
-    doubts += doubts_of_map(refinement, point_errors(metric.final))
-    advice = "let the offset be searched for ([positions] time_offset)"
-    doubts += [Doubt(reason, advice) for reason in metric.inputs.positions.doubts_of_clock()]
+    doubts += doubts_of_points(point_errors(metric.final))
+    doubts += () if metric.kept is None else doubts_of_refinement(metric.kept.summary)
+    doubts += run.doubts
     # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
-    of_clocks = (*metric.inputs.positions.doubts_of_found_clock(), *metric.rivals.doubts)
-    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *of_clocks)
+    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *metric.rivals.doubts)
     doubts += known_doubts
     of_map = [doubt.reason for doubt in doubts]
-    against = (*(doubt.reason for doubt in of_lens), *diagnosis.of_place, *of_clocks, *of_map)
-    place = place_of_map(metric.estimate, refinement, path, against, bent_by_m)
+    against = (*(doubt.reason for doubt in of_lens), *diagnosis.of_place, *metric.rivals.doubts, *of_map)
+    place = place_of_map(metric.estimate, metric.map_errors, path, against, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis)
     return judged.doubted(*of_lens, *map(Doubt, diagnosis.reasons), *doubts, *map(Doubt, metric.rivals.doubts))
 
@@ -66,10 +65,10 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     if not metric.final.num_points3D():
         return ()
     is_learnt = any(each.shows_bending for each in metric.kinds)
-    factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else None
+    factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else LARGEST_FACTOR
     half_width_95 = metric.estimate.uncertainty.half_width_95
-    doubt = doubt_of_lens(fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE)), factor, half_width_95)
-    return () if doubt is None else (doubt,)
+    fit = fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE))
+    return () if fit is None else fit.doubts(factor, half_width_95)
 
 
 def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: Array) -> Diagnosis:

@@ -12,7 +12,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_pieces
 from rangesfm.errors import GeometryError, number_text
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
-from rangesfm.measurements.kind import Doubt, MapState
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.clock_rivals import by_rivals
 from rangesfm.pipeline.close_loops import close_loops_of_survey
@@ -20,11 +20,10 @@ from rangesfm.pipeline.judge_map import judge_map, with_cause
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.refine_map import refine_map, with_anchors_on_likelier_sides
 from rangesfm.solver.bending import MapBending
-from rangesfm.survey.kinds_in_map import ranges_in_map, without_contradicted
+from rangesfm.survey.kinds_in_map import without_contradicted
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.numerics import NOTHING_KNOWN
-from rangesfm.util.geometry.poses import model_poses
 
 _ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusal
 
@@ -75,24 +74,19 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     survey, inputs, offset = run.survey, run.inputs, path.time_offset
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
-    # Which control points and lengths contradict the others depends on how far the photos let the map drift.
-    is_judged = not is_a_start or inputs.positions.are_known or len(inputs.tape.control().distances) > 0
-    bending = bending_by_survey(survey, path) if is_judged else None
+    # Which measurements contradict the others depends on how far the photos let the map drift.
+    bending = None if is_a_start and not inputs.may_be_left_out else bending_by_survey(survey, path)
     limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
     except GeometryError as error:
-        if doubts := "; ".join(inputs.positions.doubts_of_clock()):
-            raise GeometryError(f"{error}; {doubts}") from None
+        if run.doubts:
+            raise GeometryError("; ".join([str(error), *(doubt.reason for doubt in run.doubts)])) from None
         raise _refused_with_cause(error, run, path) from None
     if not is_a_start:
         estimate = estimate.where_bent(survey.scale)
-    scaled = rescale(path.sfm, estimate.metric_from_sfm)
-    ranges = ranges_in_map(inputs, estimate, path.trajectory, survey.refine)
-    predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
-    weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
-    kept, rivals = without_contradicted(inputs, estimate.kinds), by_rivals(run, path, estimate)
-    return MetricResult(path, kept, estimate, scaled, predicted, weights, rivals)
+    scaled, kept = rescale(path.sfm, estimate.metric_from_sfm), without_contradicted(inputs, estimate.kinds)
+    return MetricResult(path, kept, estimate, scaled, by_rivals(run, path, estimate))
 
 
 def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:

@@ -13,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.place import Place
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.with_ranges import RefineSummary
+from rangesfm.estimation.with_ranges import RefinedRanges, RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
@@ -91,8 +91,6 @@ class MetricResult:
         inputs: what was measured, without what contradicts all else in the map.
         estimate: of the scale.
         scaled: the model after rescaling.
-        predicted_scaled_m: (n,) ranges predicted by the scaled model; NaN for ranges without a place on the path.
-        scaled_weights: (n,) robust weights by the scaled model.
         rivals: other likely time offsets.
         refined: the map after the refinement; None without one.
         place: how well the place of the map in the site frame is known; None where the frame is that of the first
@@ -105,8 +103,6 @@ class MetricResult:
     inputs: RangingInputs
     estimate: ScaleEstimate
     scaled: pycolmap.Reconstruction
-    predicted_scaled_m: Array
-    scaled_weights: Array
     rivals: Rivals
     refined: RefinedMap | None = None
     place: Place | None = None
@@ -142,45 +138,30 @@ class MetricResult:
         return self.all_measured.kinds
 
     @property
-    def _stage(self) -> ScaleEstimate | RefineSummary:
-        """Return what the final model comes from: the kept refinement, or the estimate of the scale."""
-        return self.estimate if self.kept is None else self.kept.summary
+    def ranges(self) -> ScaleEstimate | RefinedRanges:
+        """Return the ranges as the final map has them."""
+        return self.estimate if self.kept is None else self.kept.summary.ranges
 
     @property
     def anchors(self) -> tuple[AnchorEstimate, ...]:
-        return self._stage.anchors
+        return self.ranges.anchors
 
     @property
     def observations(self) -> RangeObservations:
         """Return the ranges with their final status."""
-        return self._stage.observations
-
-    @property
-    def predicted_m(self) -> Array:
-        """Return the ranges predicted by the final model, (n,) metres."""
-        return self.predicted_scaled_m if self.kept is None else self.kept.summary.predicted_m
-
-    @property
-    def weights(self) -> Array:
-        """Return the robust weights of the ranges by the final model, (n,) in [0, 1]."""
-        return self.scaled_weights if self.kept is None else self.kept.summary.weights
-
-    @property
-    def range_stddev_m(self) -> Array:
-        """Return the last noise stddev of each range, (n,) metres; NaN for ranges without a place on the path."""
-        return self._stage.errors.stddev_m
+        return self.ranges.observations
 
     @property
     def residuals_m(self) -> Array:
         """Return predicted minus measured ranges by the final model, (n,) metres."""
-        return self.predicted_m - self.observations.log.range_m
+        return self.ranges.predicted_m - self.observations.log.range_m
 
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
         """Return the covariance (3, 3) of each keyframe's projection centre by photo; empty if it is not known."""
-        if self.kept is None or (found := self.kept.summary.covariance) is None:
+        if (errors := self.map_errors) is None:
             return {}
-        return dict(zip(self.trajectory.image_names, found.centers_m2(self.trajectory.frame_ids), strict=True))
+        return dict(zip(self.trajectory.image_names, errors.centers_m2(self.trajectory.frame_ids), strict=True))
 
     @property
     def upward(self) -> Array | None:
@@ -211,7 +192,7 @@ class MetricResult:
             refined = replace(
                 refined,
                 model=rescale(refined.model, shift),
-                summary=replace(refined.summary, anchors=_moved_anchors(refined.summary.anchors, offset_m)),
+                summary=refined.summary.with_anchors(_moved_anchors(refined.summary.ranges.anchors, offset_m)),
                 loops=refined.loops and refined.loops.moved(offset_m),
             )
         return replace(

@@ -18,14 +18,16 @@ from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import by_photos
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
-from rangesfm.estimation.with_ranges import RefineSummary, summarize
+from rangesfm.estimation.with_ranges import refined_ranges, summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
+from rangesfm.measurements.kind import MapState
 from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
-from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map, ranges_in_map
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map
 from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.geometry.poses import model_poses
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import at_most
@@ -109,8 +111,7 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             )
     model, path = rest.problem.metric, metric.trajectory
     model.update_point_3d_errors()
-    given = ranges_in_map(metric.inputs, metric.estimate.with_anchors(metric.anchors), path, options)
-    summary = summarize(rest, given, covariance, factor)
+    summary = summarize(rest, covariance, factor)
     broken = why_broken(metric.scaled, model, path, metric.estimate, summary, options.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
@@ -123,25 +124,24 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
     elif broken:
         scale = on_map.metres_per_unit
     else:
-        scale = on_map.scale.value
-        model, summary = _at_estimate(on_map, model, summary, path)
+        scale, (model, state) = on_map.scale.value, _at_estimate(on_map, rest, path)
+        summary = replace(summary, ranges=refined_ranges(rest, state, covariance, on_map.estimate))
     return replace(metric, refined=RefinedMap(model, summary, rest.problem.kinds, on_map, scale, broken))
 
 
-def _at_estimate(
-    at_rest: JointMap, model: pycolmap.Reconstruction, summary: RefineSummary, unscaled: Trajectory
-) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-    """Return a map bent and moved as a whole to its best estimate (section 6), with its summary.
+def _at_estimate(at_rest: JointMap, rest: MapAtRest, unscaled: Trajectory) -> tuple[pycolmap.Reconstruction, MapState]:
+    """Return a map bent and moved as a whole to its best estimate (section 6), and its state.
 
     Args:
-        model: the map at rest. unscaled: path of the unscaled model.
+        unscaled: path of the unscaled model.
     """
-    bent, model = likely_bend(at_rest, unscaled), pycolmap.Reconstruction(model)
-    for moved in (moved for each in at_rest.kinds for moved in each.moved_ranges(at_rest.posterior, bent)):
-        summary = summary.moved(at_rest.estimate, *moved)
+    bent, model = likely_bend(at_rest, unscaled), pycolmap.Reconstruction(rest.problem.metric)
     if len(bent.frame_ids):
         bend(model, bent)
-    return rescale(model, at_rest.estimate), summary
+    model, blocks = rescale(model, at_rest.estimate), {**rest.state.blocks}
+    for each in at_rest.kinds:
+        blocks.update(each.moved(at_rest.posterior, bent).blocks)
+    return model, MapState(model_poses(model, rest.problem.frame_ids), blocks)
 
 
 def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
@@ -160,7 +160,7 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
         if sides.has_crossed:
             again = refine_map(run, replace(start, estimate=estimate))
             return metric if again.kept is None else again
-        summary = replace(summary, anchors=sides.moved(at.estimate).applied_to(summary.anchors))
+        summary = summary.with_anchors(sides.moved(at.estimate).applied_to(summary.ranges.anchors))
     return replace(metric, estimate=estimate, refined=replace(metric.kept, summary=summary))
 
 

@@ -36,7 +36,7 @@ from rangesfm.result.result_tables import (
     TimeOffsetCurve,
 )
 from rangesfm.result.summary import ResultSummary
-from rangesfm.solver.mistakes import RISK, finite
+from rangesfm.solver.mistakes import RISK
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 
 # A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
@@ -101,7 +101,9 @@ def _time_offset(found: MetricResult) -> entries.TimeOffsetEntry:
     if offset.is_given:
         return entries.TimeOffsetEntry(value_s=offset.value_s, stddev_s=0.0, estimated=False, note=None)
     in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
-    return entries.TimeOffsetEntry.model_validate({**vars(offset), **in_ppm, "estimated": True})
+    return entries.TimeOffsetEntry.model_validate(
+        {**vars(offset), **in_ppm, "note": offset.note or None, "estimated": True}
+    )
 
 
 def _ranges(found: MetricResult) -> entries.RangesEntry:
@@ -156,18 +158,19 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
     if found.refined is None:
         return None
     why_broken, summary = found.refined.why_broken, found.refined.summary
-    tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
+    ranges, covariance = summary.ranges, summary.covariance
     others = {
         "kept": not why_broken,
         "why_not_kept": why_broken,
         "iterations": summary.num_iterations,
         "keyframe_graph_steps": summary.num_graph_steps,
-        "correlation_inflation": summary.errors.inflation,
+        "correlation_inflation": ranges.errors.inflation,
         "converged": summary.converged,
         "scale_value": found.refined.scale,
         "relative_scale_stddev": None if covariance is None else covariance.scale_stddev,
-        "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
-        "time_offset_change_s": summary.time_shift_s,
+        "tag_in_cam_m": dict(zip(ranges.observations.log.tag_ids, ranges.tags_in_cam_m, strict=True)),
+        "time_offset_change_s": ranges.time_shift_s,
+        "short_range_error_m": ranges.short_range_error_m,
     }
     return entries.RefineEntry.model_validate({**vars(summary), **others})
 
@@ -181,7 +184,7 @@ def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
     is_found = any(test.rejected for test in diagnosis.tests)
     given = [test for test in diagnosis.tests if test.name in CHECKED_KINDS and test.is_checked is False]
     return entries.ReliabilityEntry(
-        scale_within=None if is_found else finite(float(np.expm1(bound))),
+        scale_within=None if is_found else float(np.expm1(bound)),
         risk=RISK,
         limited_by=limited_by,
         unchecked=tuple(mistake_in_words(test.name, test.subject) for test in given),
@@ -306,13 +309,13 @@ def ranges_as_used(found: MetricResult) -> RangesAsUsed:
         anchor_id=tuple(anchor_ids),
         tag_id=tuple(tag_ids),
         range_m=log.range_m,
-        range_stddev_m=found.range_stddev_m,
+        range_stddev_m=found.ranges.errors.stddev_m,
         keyframe_before=tuple(names[i] for i in observations.before),
         keyframe_after=tuple(names[i] for i in observations.after),
         weight=np.where(observations.before >= 0, observations.fraction, np.nan),
-        predicted_scaled_m=found.predicted_scaled_m,
-        predicted_refined_m=unknown if found.kept is None else found.kept.summary.predicted_m,
+        predicted_scaled_m=found.estimate.predicted_m,
+        predicted_refined_m=unknown if found.kept is None else found.kept.summary.ranges.predicted_m,
         residual_m=found.residuals_m,
-        robust_weight=np.where(has_say, found.weights, np.nan),
+        robust_weight=np.where(has_say, found.ranges.weights, np.nan),
         status=tuple(labels[status] for status in observations.status.tolist()),
     )

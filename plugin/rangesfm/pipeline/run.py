@@ -173,6 +173,7 @@ def _with_clocks(run: SurveyRun, path: Trajectory) -> SurveyRun:
     positions, imu = run.inputs.positions, run.inputs.imu
     timed, without = partial(positions.timed_on, path), replace(positions, antenna=None)
     positions = _or_left_out(run, "positions.path", "positions of the antenna are", timed, without)
+    run.journal.warn(*positions.notes_on_clock)
     if imu is not None:
         imu = _or_left_out(run, "imu.path", "inertial sensor is", partial(imu.aligned_with, path), None)
     if imu is not None and (found := imu.alignment) is not None:
@@ -180,7 +181,8 @@ def _with_clocks(run: SurveyRun, path: Trajectory) -> SurveyRun:
         half_s = NORMAL_95 * found.time_offset_stddev_s
         offset = f"{found.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
         run.journal.note(f"time offset of the inertial sensor: {offset}, by {found.num_turns} turns of the photos")
-    return replace(run, inputs=replace(run.inputs, positions=positions, imu=imu))
+    inputs, doubts = replace(run.inputs, positions=positions, imu=imu), tuple(positions.doubts_of_clock)
+    return replace(run, inputs=inputs, doubts=doubts)
 
 
 def _or_left_out(run: SurveyRun, key: str, what: str, find: Callable[[], _Sensor], without: _Sensor) -> _Sensor:

@@ -79,8 +79,8 @@ class SurveyPlan:
         up_stddev_deg: standard deviation of the vertical by the inertial sensor; None without one.
         by_kind: the same by each kind of ``ALONE`` alone; empty where the plan has one of them.
         warnings: what is odd about the plan, and what a run will leave out.
-        mistakes: for each possible mistake the smallest size that would be found (None: no size that can happen), and
-            the largest effect of a mistake that is not found, the largest on the scale first (None: without limit).
+        mistakes: for each possible mistake the smallest size that would be found (inf: no size that can happen), and
+            the largest effect of a mistake that is not found, the largest on the scale first (inf: without limit).
         advice: changes that would gain something.
         expected: the estimate from which all this is computed.
     """
@@ -250,19 +250,18 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):
         row = row_of(test)
-        sizes: dict[str, Any] = {name: getattr(row, name) for name in _SIZES}
+        sizes: dict[str, float] = {name: getattr(row, name) for name in _SIZES}
         if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest
             share = test.hypothesis.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
-            sizes = {name: None if size is None else share * size for name, size in sizes.items()}
-            sizes["smallest_detectable"] = None
-        limited: dict[str, Any] = {name: None if (size or 0.0) > OPEN else size for name, size in sizes.items()}
+            sizes = {name: share * size for name, size in sizes.items()} | {"smallest_detectable": np.inf}
+        limited: dict[str, Any] = {name: np.inf if size > OPEN else size for name, size in sizes.items()}
         found.append(replace(row, **limited))
-    return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
+    return tuple(sorted(found, key=lambda each: -each.effect_on_scale))
 
 
-def size_in_words(size: float | None, unit: str) -> str:
+def size_in_words(size: float, unit: str) -> str:
     """Return the size of a mistake, with a fraction as a percentage; "never found" where no size would be found."""
-    if size is None:
+    if not np.isfinite(size):
         return "never found"
     return f"{100 * size:.2g} %" if unit == "1" else f"{size:.2g} {unit}"
 
@@ -316,9 +315,8 @@ def _found(plan: SurveyPlan) -> Iterator[str]:
         yield "mistakes just too small to be found, and their largest effects:"
     for mistake in plan.largest_mistakes:
         size = size_in_words(mistake.smallest_detectable, mistake.unit)
-        scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
-        place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
-        yield f"  {mistake_in_words(mistake.name, mistake.subject)}: {size}; scale {scale}, place {_rough(place_m)}"
+        scale, place = _rough(100 * mistake.effect_on_scale, "%"), _rough(mistake.effect_on_place_m)
+        yield f"  {mistake_in_words(mistake.name, mistake.subject)}: {size}; scale {scale}, place {place}"
 
 
 def _advised(plan: SurveyPlan) -> Iterator[str]:

@@ -237,7 +237,7 @@ def _mistakes(plan: SurveyPlan) -> ReportTable:
         [
             mistake_in_words(each.name, each.subject),
             size_in_words(each.smallest_detectable, each.unit),
-            "open" if each.effect_on_scale is None else percent(each.effect_on_scale),
+            percent(each.effect_on_scale),
             rough(each.effect_on_place_m, "m"),
         ]
         for each in plan.largest_mistakes

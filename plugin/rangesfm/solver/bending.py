@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 from typing import NamedTuple, Protocol
@@ -109,7 +109,7 @@ def bending_part(name: str, covariance: Array, factor: float, spread: float) -> 
     return Component(name, covariance / size_m**2, factor * size_m, spread)
 
 
-def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool, is_firm: Mask | None = None) -> Array:
+def without_similarity(by_pose: Array, path: Trajectory, is_firm: Mask, *, frame_is_free: bool) -> Array:
     """Return the (c, 6 k) derivatives of functions made independent of the map's scale and place.
 
     The scale is that of the similarity that fits the centres best. The place is also that of the similarity if it is
@@ -117,18 +117,17 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool,
 
     Args:
         path: the k poses, in the model's world.
-        is_firm: (k,) True for the poses whose centres count; None: all. One that hangs loose on the others may be
-            anywhere, and would make size and place of the whole map as uncertain.
+        is_firm: (k,) True for the poses whose centres count. One that hangs loose on the others may be anywhere, and
+            would make size and place of the whole map as uncertain.
     """
     motions = _motions(path)
-    return np.asarray(by_pose - (by_pose @ motions) @ similarity_of(path, frame_is_free=frame_is_free, is_firm=is_firm))
+    return np.asarray(by_pose - (by_pose @ motions) @ similarity_of(path, is_firm, frame_is_free=frame_is_free))
 
 
-def similarity_of(path: Trajectory, *, frame_is_free: bool, is_firm: Mask | None = None) -> Array:
+def similarity_of(path: Trajectory, is_firm: Mask, *, frame_is_free: bool) -> Array:
     """Return the (7, 6 k) derivatives of the similarity of a path by its poses; arguments as above."""
     motions = _motions(path)
-    counts = np.ones(len(path)) if is_firm is None else is_firm
-    weights = np.outer(counts, np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3)).ravel()
+    weights = np.outer(is_firm, np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3)).ravel()
     weighted = motions * weights[:, None]
     lengths = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)  # in no unit, so that none is too small to count
     of_poses = np.linalg.pinv(weighted / lengths, rcond=1e-6) / lengths[:, None] * weights
@@ -169,18 +168,23 @@ class WalkBending:
     Attributes:
         given: the original path, in the model's world.
         steps: (s, 7) corrections at some of the poses: logarithm of the scale, turn and shift, in units of the walks'
-            standard deviations from start to end; None: no correction.
+            standard deviations from start to end; empty: no correction.
         frame_is_free: as in ``of_functions``, for the corrected path.
     """
 
     given: Trajectory
-    steps: Array | None = None
+    steps: Array = field(default_factory=lambda: np.zeros((0, 7)))
     frame_is_free: bool = False
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether there are corrections."""
+        return len(self.steps) > 0
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         num = len(by_pose)
         factors = self.factors(by_pose, frame_is_free=frame_is_free)
-        shift_m = np.zeros(num) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
+        shift_m = -np.einsum("csi,si->c", factors, self.steps) if self.is_corrected else np.zeros(num)
         found = []
         for name, median in _OF_PATH.items():
             own = factors[:, :, name == _OF_STEP].reshape(num, -1)
@@ -190,7 +194,7 @@ class WalkBending:
     def factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         """Return the (c, s, 7) derivatives of c functions of the path by each step; arguments as in of_functions."""
         path = self.path
-        functions = without_similarity(by_pose, path, frame_is_free=frame_is_free)
+        functions = without_similarity(by_pose, path, np.ones(len(path), dtype=bool), frame_is_free=frame_is_free)
         starts, unit = self._steps_of_path
         return np.asarray(_after(functions, path, starts) * unit)
 
@@ -220,7 +224,7 @@ class WalkBending:
     def path(self) -> Trajectory:
         """The corrected path, with the size and the place of the original path."""
         given = self.given
-        if self.steps is None:
+        if not self.is_corrected:
             return given
         starts, unit = self._steps_of_path
         bent = bent_path(given, starts, self.steps * unit)

@@ -55,12 +55,12 @@ class MistakeTest:
             was made. The statistic is 0 if its estimated size is impossible.
         words: what is the case if it was made. remedy: what to do then.
         unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a ratio.
-        size, stddev: of the mistake, estimated; the length of a vector. None: not estimated, or impossible.
-        smallest_detectable: a mistake of this size is found in four cases of five; None: it cannot be detected.
-        redundancy: how much of the mistake the other observations check, 0 to 1; None: not known.
-        is_checked: whether some mistake of this kind that is possible would be found; None: not known.
+        size, stddev: of the mistake, estimated; the length of a vector. NaN: not estimated, or impossible.
+        smallest_detectable: a mistake of this size is found in four cases of five; inf: it cannot be detected.
         effect_on_scale, effect_on_place_m: largest effect of a mistake of that size, relative and as root mean square
-            along the path; None: unlimited.
+            along the path; inf: unlimited, NaN: not computed.
+        redundancy: how much of the mistake the other observations check, 0 to 1; NaN: not computed.
+        is_checked: whether some mistake of this kind that is possible would be found; None: not known.
     """
 
     name: str
@@ -70,12 +70,12 @@ class MistakeTest:
     words: str
     remedy: str
     unit: str = ""
-    size: float | None = None
-    stddev: float | None = None
-    smallest_detectable: float | None = None
-    effect_on_scale: float | None = None
-    effect_on_place_m: float | None = None
-    redundancy: float | None = None
+    size: float = np.nan
+    stddev: float = np.nan
+    smallest_detectable: float = np.inf
+    effect_on_scale: float = np.nan
+    effect_on_place_m: float = np.nan
+    redundancy: float = np.nan
     is_checked: bool | None = None
 
     @property
@@ -115,16 +115,13 @@ def row_of_mistake(
         words,
         remedy,
         unit,
-        size=float(found.sizes[0] if len(found.sizes) == 1 else np.linalg.norm(found.sizes)) if found.is_seen else None,
-        stddev=finite(float(np.linalg.norm(found.stddevs))),
-        smallest_detectable=finite(found.smallest_detectable),
-        effect_on_scale=finite(found.effect_on_log_scale),
+        size=float(found.sizes[0] if len(found.sizes) == 1 else np.linalg.norm(found.sizes))
+        if found.is_seen
+        else np.nan,
+        stddev=float(np.linalg.norm(found.stddevs)),
+        smallest_detectable=found.smallest_detectable,
+        effect_on_scale=found.effect_on_log_scale,
     )
-
-
-def finite(value: float) -> float | None:
-    """Return the value, or None if it is infinite."""
-    return float(value) if np.isfinite(value) else None
 
 
 def in_axes(shift: Array) -> str:

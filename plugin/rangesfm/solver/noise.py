@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -141,8 +142,8 @@ def learnt_sizes(
     off_m: Array,
     design: Array,
     prior_design: Array,
-    most_unusual: Mapping[str, float] | None = None,
-    near: Mapping[str, float] | None = None,
+    most_unusual: Mapping[str, float] = MappingProxyType({}),
+    near: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, float]:
     """Return the size of each component by restricted maximum likelihood with lognormal priors, by name.
 
@@ -169,9 +170,9 @@ def learnt_sizes(
         design,
         prior_design,
     )
-    above = np.array([(most_unusual or {}).get(component.name, np.inf) for component in learnt])
-    start = np.log([(near or {}).get(component.name, component.median) for component in learnt])
-    found = likelihood.mean_stddevs(likelihood.most_likely(above, start))
+    above = np.array([most_unusual.get(component.name, np.inf) for component in learnt])
+    start = np.log([near.get(component.name, component.median) for component in learnt])
+    found = likelihood.mean_stddevs(likelihood.most_likely(start, above))
     return sizes | dict(zip((component.name for component in learnt), found.tolist(), strict=True))
 
 
@@ -196,15 +197,10 @@ class ComponentLikelihood:
     design: Array
     prior_design: Array
 
-    def most_likely(self, most_unusual: Array | float = np.inf, start: Array | None = None) -> Array:
-        """Return the (k,) most likely logarithms near a start, each at most ``most_unusual`` spreads above its median.
-
-        Args:
-            start: (k,); None: the medians.
-        """
+    def most_likely(self, start: Array, most_unusual: Array | float = np.inf) -> Array:
+        """Return the (k,) most likely logarithms near a start, at most ``most_unusual`` spreads above their medians."""
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
-        start = self.log_medians if start is None else start
         found = minimize(self._negative_with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds)
         return np.asarray(found.x)
 

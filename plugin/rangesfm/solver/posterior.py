@@ -202,16 +202,16 @@ class JointProblem:
         expected_m = float(np.sqrt(np.trace(self.bending.formal_m2) / len(self.is_used)))
         return self.noise.stddev_of_component["bending"] / expected_m if expected_m > 0 else 1.0
 
-    def learnt(self, mistake: Array | None = None, most_unusual: float = np.inf) -> JointProblem:
+    def learnt(self, *mistakes: Array, most_unusual: float = np.inf) -> JointProblem:
         """Return the problem with the sizes of the errors that the observations show.
 
         Args:
-            mistake: (c, m) columns of a mistake. It explains what it can, as the errors that it causes would otherwise
-                be taken for noise, in which it then hides.
+            mistakes: (c, m) columns of each. They explain what they can, as the errors that they cause would otherwise
+                be taken for noise, in which they then hide.
             most_unusual: largest size of a component above its median, in spreads over surveys.
         """
         used, linear = self.is_used, self.linear
-        columns = np.zeros((len(used), 0)) if mistake is None else mistake
+        design = np.hstack([linear.design, *mistakes])[used]
         # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
         most_bent = np.inf if len(self.rows) == 1 else SIGNIFICANT_STDDEVS
         components = self.components
@@ -224,8 +224,8 @@ class JointProblem:
         sizes = learnt_sizes(
             components,
             -linear.residual_m[used],
-            np.hstack([linear.design[used], columns[used]]),
-            np.pad(linear.prior_design, ((0, 0), (0, columns.shape[1]))),
+            design,
+            np.pad(linear.prior_design, ((0, 0), (0, design.shape[1] - linear.design.shape[1]))),
             {name: min(most_unusual, most_bent) if name in BENDS else most_unusual for name in self.sizes},
         )
         return replace(self, sizes=sizes)
@@ -244,17 +244,11 @@ class JointProblem:
         linear, noise = self.among(rows)
         return linear.solved(noise.covariance_m2).mistake(-columns[rows])
 
-    def posterior(self, *, is_refined: bool = False, formal: float | None = None) -> Posterior:
-        """Return what all observations say of the map.
-
-        Args:
-            is_refined: whether the photos let the map bend in its fit.
-            formal: as of ``Posterior.best``; None: it is computed.
-        """
+    def posterior(self, *, is_refined: bool = False) -> Posterior:
+        """Return what all observations say of the map; ``is_refined``: whether the photos let it bend in its fit."""
         at, (linear, noise) = np.ix_(self.is_used, self.is_used), self.among(self.is_used)
-        if formal is None:
-            alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
-            formal = float(np.sqrt(linear.solved(alone_m2[at]).covariance[0, 0]))
+        alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
+        formal = float(np.sqrt(linear.solved(alone_m2[at]).covariance[0, 0]))
         return Posterior.best(linear, noise, formal)
 
     def predicted_m2(self, kind: str, covariance: Array) -> Array:

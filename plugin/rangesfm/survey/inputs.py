@@ -79,6 +79,11 @@ class RangingInputs:
         """True if the photos' times are needed, for ranges or positions by time, or for an inertial sensor."""
         return self.log.image_name is None or self.positions.needs_times or self.imu is not None
 
+    @property
+    def may_be_left_out(self) -> bool:
+        """True if there are measurements of which a map may leave out single ones: positions, and control lengths."""
+        return self.positions.are_known or len(self.tape.control().distances) > 0
+
     def listed_photos(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield the photos that each file names, after what it says of them."""
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape

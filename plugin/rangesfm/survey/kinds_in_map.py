@@ -29,14 +29,12 @@ from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.measurements.ranges.cost import Ranges
-from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of_map
+from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
-from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -71,7 +69,7 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
     if not len(inputs.log):
         return None
     if at.rest is not None and before is not None:
-        [ranges] = (kind for kind in at.rest.problem.kinds if isinstance(kind, Ranges))
+        ranges = ranges_of(at.rest.problem.kinds)
         return RangesAtRest(before, at.path, at.metres_per_unit, ranges, at.rest.state, at.bending)
     if inputs.tape.distances:
         distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
@@ -176,22 +174,13 @@ def measured_in_map(
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    ranges, options = ranges_in_map(inputs, estimate, path, survey.refine), survey.refine
+    placed, arms_m, of_log = estimate.metric_from_sfm, inputs.tag_in_cam_m, estimate.ranges
+    found = ranges_of_map(path, of_log.observations, placed, arms_m, of_log.anchors, of_log.errors, survey.refine)
+    ranges = replace(found, shared_errors_m=of_log.shared_errors_m)
     markers = tape.end_markers | {name: of for kind in on_map.kinds for name, of in kind.markers.items()}
     points = NamedPoints.in_model(model, markers, ranges.placed_anchors, path.frame_ids)
-    at = MapToFit(points, path, options)
+    at = MapToFit(points, path, survey.refine)
     of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, at))
     upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
     levelled = () if upward is None else (UpwardDirection(upward),)
     return (*measured_by_radio(ranges, at), *taped_lengths(tape, at), *of_kinds, *levelled)
-
-
-def ranges_in_map(inputs: RangingInputs, estimate: ScaleEstimate, path: Trajectory, options: RefineOptions) -> Ranges:
-    """Return the ranges of the log on a scaled map, with the errors that all other measurements may correct.
-
-    Args:
-        estimate: of the scale. path: of the unscaled model.
-    """
-    placed, arms_m = estimate.metric_from_sfm, inputs.tag_in_cam_m
-    found = ranges_of_map(path, estimate.observations, placed, arms_m, estimate.anchors, estimate.errors, options)
-    return replace(found, shared_errors_m=estimate.ranges.shared_errors_m)

@@ -13,6 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
@@ -62,12 +63,14 @@ class SurveyRun:
         inputs: what was read from its files, measured in metres.
         journal: is told of stages and warnings.
         times: of the photos; None where they are not needed, or not yet known.
+        doubts: of any map of the survey, known before one is made.
     """
 
     survey: Survey
     inputs: RangingInputs
     journal: Journal
     times: ImageTimes | None = None
+    doubts: tuple[Doubt, ...] = ()
 
     def changed(self, values: Mapping[str, Any]) -> SurveyRun:
         """Return the same with other options by dotted key, as ``Survey.changed``."""

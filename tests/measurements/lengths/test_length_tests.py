@@ -33,5 +33,5 @@ def test_what_a_length_could_do_unfound_is_what_the_scale_does_when_it_is_so_muc
         longer = by(replace(located, distance_m=lengths_m + step_m))
         test = found[f"{k}a to {k}b"]
         by_metre = abs(longer.alone.scale.value / scale.alone.scale.value - 1) / 1e-4
-        assert test.effect_on_scale == pytest.approx(by_metre * known(test.smallest_detectable), rel=0.02)
+        assert test.effect_on_scale == pytest.approx(by_metre * test.smallest_detectable, rel=0.02)
         assert test.size == pytest.approx(0.0, abs=1e-6)

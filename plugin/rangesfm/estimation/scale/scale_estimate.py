@@ -145,6 +145,16 @@ class ScaleEstimate:
         return self.ranges.errors
 
     @property
+    def predicted_m(self) -> Array:
+        """(n,) ranges of the log as the scaled map predicts them, metres; NaN without a place."""
+        return self.ranges.predicted_m(self.metric_from_sfm)
+
+    @property
+    def weights(self) -> Array:
+        """(n,) robust weights in [0, 1] of the ranges about these; NaN without a place."""
+        return self.errors.robust_weights(self.predicted_m - self.observations.log.range_m)
+
+    @property
     def noise_stddev_m(self) -> float:
         """Standard deviation of an ordinary range."""
         return self.ranges.noise_stddev_m

@@ -24,7 +24,7 @@ from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
-from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests, finite
+from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, SIGNIFICANT_STDDEVS
@@ -163,10 +163,10 @@ class LengthScale(KindOnMap):
                 f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
                 remedy=_MEASURE_AGAIN,
                 unit="m",
-                size=size_m if is_known else None,
-                stddev=finite(stddev_m),
-                smallest_detectable=finite(smallest_m),
-                effect_on_scale=finite(abs(float(self.by_metre[k])) * smallest_m) if is_known else None,
+                size=size_m if is_known else np.nan,
+                stddev=stddev_m,
+                smallest_detectable=smallest_m,
+                effect_on_scale=abs(float(self.by_metre[k])) * smallest_m,
                 redundancy=float(self.redundancy[k]),
                 is_checked=bool(is_known),
             )
@@ -176,7 +176,7 @@ class LengthScale(KindOnMap):
         is_checked = np.isfinite(self.stddev_m)
         for slope in (np.abs(self.by_metre) * self.stddev_m)[is_checked].tolist():
             yield HiddenMistake("length", slope, self.threshold, 1, np.inf)
-        compared = [row.stddev for row in against if row.stddev is not None]
+        compared = [row.stddev for row in against if np.isfinite(row.stddev)]
         if compared:
             threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
             yield HiddenMistake("lengths", min(compared), threshold, 1, np.inf)

@@ -343,7 +343,7 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
     rows += against
     rows.sort(key=lambda row: row.threshold - row.statistic)
-    return MistakeTests(tuple(rows), tuple(reasons), of_place=tuple(reasons))
+    return MistakeTests(tuple(rows), tuple(reasons), of_place=(*reasons, *positions.surveyed.notes_on_clock))
 
 
 def _of_check_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:

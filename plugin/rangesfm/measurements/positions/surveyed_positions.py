@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.clock import find_antenna_offset
@@ -86,22 +87,24 @@ class SurveyedPositions:
         """Return the positions with the points of these names marked as left out."""
         return replace(self, points=self.points.without([*names]))
 
-    def doubts_of_clock(self) -> Iterator[str]:
+    @property
+    def doubts_of_clock(self) -> Iterator[Doubt]:
         """Yield the reason to doubt the given time offset of the antenna's positions, if there is one."""
         track = self.antenna
         if track is not None and track.other_offset_s is not None:
             ahead_s = track.offset_s - track.other_offset_s
-            yield (
+            yield Doubt(
                 f"the positions fit the photos' path at a time offset of {track.other_offset_s:+.2f} s, not at the "
                 f"given {track.offset_s:+.2f} s: their clock is {abs(ahead_s):.1f} s "
-                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone; they are not used"
+                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone; they are not used",
+                "let the offset be searched for ([positions] time_offset)",
             )
 
-    def doubts_of_found_clock(self) -> Iterator[str]:
-        """Yield the reason to doubt the time offset that was found, which moves the map along the path."""
+    @property
+    def notes_on_clock(self) -> tuple[str, ...]:
+        """Why the time offset that was found is doubtful, which moves the map along the path; empty if it is not."""
         offset = None if self.antenna is None else self.antenna.offset
-        if offset is not None and not offset.is_certain and offset.note is not None:
-            yield offset.note
+        return () if offset is None or offset.is_certain or not offset.note else (offset.note,)
 
     def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
         """Yield a line for the user about points that a model does not show."""

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.kind import Block, ByBlock, Linearization, MapState, Measurements, Weights
+from rangesfm.measurements.kind import Block, ByBlock, Doubt, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, misfits
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RefineOptions
@@ -60,6 +60,10 @@ class Ranges(Measurements):
     def rows(self) -> Indices:
         """(k,) rows of the ranges that take part: all that have a place."""
         return self.observations.placed_rows
+
+    @property
+    def takes_part(self) -> bool:
+        return len(self.rows) > 0
 
     @property
     def places_map(self) -> bool:
@@ -192,6 +196,14 @@ class Ranges(Measurements):
     def estimated(self, state: MapState, block: Block) -> float | None:
         """Return a number of the radio, ``CLOCK`` or ``SHORT``; None if it is not estimated."""
         return float(state.blocks[block][0]) if block in state.blocks else None
+
+    def misfits(self, state: MapState) -> tuple[Doubt, ...]:
+        """Return the reasons why the ranges fit a state worse than their noise suggests."""
+        if not self.takes_part:
+            return ()
+        rows, log, seen = self.rows, self.observations.log, self.observations
+        times = seen.before + seen.fraction if log.timestamp_s is None else log.timestamp_s
+        return misfits(self.errors, (self.predicted_m(state) - log.range_m)[rows], times[rows])
 
     def antennas_m(self, state: MapState) -> tuple[Array, Array]:
         """Return the (k, 3) places of tag and camera at the ranges that take part."""

@@ -52,9 +52,9 @@ def ranges_of_map(
 
 def measured_by_radio(ranges: Ranges, at: MapToFit) -> Iterator[Measurements]:
     """Yield the ranges of a log to anchors on a metric map, and the lengths between anchors, if there are any."""
-    if len(ranges.rows):
+    if ranges.takes_part:
         ranges = ranges.begun(MapState(at.points.state.poses, ranges.blocks))
-        yield ranges
+    yield ranges
     if len((by_radio := _between_anchors(ranges, at.points)).ends):
         yield by_radio
 
@@ -112,6 +112,6 @@ def lengths_by_radio(
     return LocatedDistances.between_anchors(corrected_m, np.sqrt(variance), pairs.reshape(-1, 2))
 
 
-def ranges_of(kinds: Sequence[Measurements], given: Ranges) -> Ranges:
-    """Return the ranges among the measurements of a map; those that were given if none takes part."""
-    return next((kind for kind in kinds if isinstance(kind, Ranges)), given)
+def ranges_of(kinds: Sequence[Measurements]) -> Ranges:
+    """Return the ranges among the measurements of a map."""
+    return next(kind for kind in kinds if isinstance(kind, Ranges))

@@ -104,6 +104,16 @@ class RangeObservations:
         """Index of the nearest keyframe (n,); -1 without a position on the path."""
         return np.where(self.fraction < 0.5, self.before, self.after)
 
+    def predicted_m(self, metric_from_model: Similarity, anchors_m: Array, biases_m: Array) -> Array:
+        """Return the (n,) ranges where a similarity places the path, metres; NaN without a position on it.
+
+        Args:
+            anchors_m, biases_m: (m, 3) and (m,) of the log's anchors, in the metric world.
+        """
+        index = self.log.anchor_index
+        antennas_m = metric_from_model.apply(self.centers) + self.tag_from_center @ metric_from_model.rotation.T
+        return np.asarray(np.linalg.norm(antennas_m - anchors_m[index], axis=1) + biases_m[index])
+
     def on_path(self, rows: Indices) -> OnPath:
         """Return the positions on the path of these rows, which must have one."""
         return OnPath(self.before[rows], self.after[rows], self.fraction[rows])

@@ -105,7 +105,7 @@ def test_offset_is_found_through_outliers_whatever_the_epochs(num_anchors: int, 
     assert found.value_s == pytest.approx(offset_s, abs=0.03)
     assert abs(found.value_s - offset_s) < 4 * found.stddev_s < 0.1
     assert found.offset_matters
-    assert found.note is None
+    assert not found.note
 
 
 def test_estimate_follows_a_shift_of_the_log() -> None:
@@ -180,7 +180,6 @@ def test_drift_of_200_ppm_is_noticed_and_named_and_followed() -> None:
     assert found.value_s == pytest.approx(30.0, abs=0.01)
     assert found.drift == pytest.approx(200e-6, abs=40e-6)
     assert abs(found.drift - 200e-6) < 4 * found.drift_stddev
-    assert found.note is not None
     assert "the clocks drift: the camera's gains +" in found.note
     assert "ppm on the radio's" in found.note
     # The offset changes by 0.12 s over the log, and is known to a few milliseconds everywhere.
@@ -191,7 +190,7 @@ def test_clocks_that_run_alike_are_not_said_to_drift() -> None:
     walk = handheld(600)
     times = range_times(0, 600, rate_hz=5)
     found = estimate(walk.log(times, 30.0), walk.photos(photo_times(600)))
-    assert found.note is None
+    assert not found.note
     assert not found.drift_is_followed
     assert abs(found.drift) < 3 * found.drift_stddev < 100e-6
     assert np.all(found.at(times) == found.value_s)
@@ -270,7 +269,6 @@ def test_bursts_around_still_photos_are_centred_on_them(num_stops: int, first_ph
     assert found.drift == 0
     # A burst of two seconds can be moved by two seconds either way before it is half-way to the next photo.
     assert found.stddev_s == pytest.approx(4 / np.sqrt(12), abs=0.05)
-    assert found.note is not None
     assert "stands still" in found.note
     best = found.curve.costs_m == found.curve.costs_m.min()
     assert np.ptp(found.curve.offsets_s[best]) == pytest.approx(4.0, abs=0.2)
@@ -281,7 +279,7 @@ def test_bursts_of_a_moving_camera_are_not_said_to_be_still() -> None:
     found = estimate(survey.log, survey.photos)
     assert found.offset_matters
     assert found.value_s == pytest.approx(0.83, abs=0.3)
-    assert found.note is None
+    assert not found.note
 
 
 def test_bursts_that_suit_several_photos_leave_several_offsets() -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rangesfm.arrays import Array
+from rangesfm.util.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,11 @@ class AnchorEstimate:
     prior_bias_stddev_m: float
     mirror_position_m: Array | None = None
     position_covariance_m2: Array | None = None
+
+    def mirror_moved(self, change: Similarity) -> AnchorEstimate:
+        """Return it with its mirror image, if there is one, where a similarity moves that."""
+        mirror_m = self.mirror_position_m
+        return self if mirror_m is None else replace(self, mirror_position_m=change.apply(mirror_m))
 
 
 def default_anchor_frame(anchors: Sequence[Anchor]) -> str:

@@ -359,7 +359,7 @@ def fit_clocks(observed: Observed, path: PathSamples, offset_s: float) -> tuple[
         times_s = observed.times_s + followed * (observed.times_s - reference_s)
         fit = refine_offset(replace(observed, times_s=times_s), path, fit.offset_s)
         found = fit.timed()
-    note = _drift_note(followed, found.drift_stddev, observed.times_s) if followed else None
+    note = _drift_note(followed, found.drift_stddev, observed.times_s) if followed else ""
     drift, is_followed = followed or found.drift, followed != 0
     return fit, replace(found, drift=drift, drift_is_followed=is_followed, reference_s=reference_s, note=note)
 

@@ -37,7 +37,7 @@ class TimeOffset:
         drift_stddev: its standard deviation; infinite if no drift was estimated.
         drift_is_followed: whether the drift is significant, so that ``at`` follows it.
         reference_s: radio's time at which the clocks differ by ``value_s``.
-        note: message for the user, or None.
+        note: message for the user; empty without one.
         probability: probability that the value is the right offset, and none of the rivals is.
         rivals: other offsets that cannot be ruled out, the most likely first; no drift is followed with them.
         is_certain: whether the error of a range due to ``stddev_s`` is smaller than its noise.
@@ -51,7 +51,7 @@ class TimeOffset:
     drift_stddev: float = np.inf
     drift_is_followed: bool = False
     reference_s: float = 0.0
-    note: str | None = None
+    note: str = ""
     probability: float = 1.0
     rivals: tuple[TimeOffset, ...] = ()
     is_certain: bool = True

@@ -159,7 +159,7 @@ def offset_of_motion(observed: Observed, path: PathSamples, *, seed: int, progre
     found = replace(
         found,
         curve=final.observed.scan(path, final.weights).around(final.offset_s),
-        note="; ".join(filter(None, (found.note, None if is_certain else uneven))) or None,
+        note="; ".join(filter(None, (found.note, "" if is_certain else uneven))),
         probability=probability,
         is_certain=is_certain,
     )

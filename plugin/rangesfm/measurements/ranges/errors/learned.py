@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def learn_errors(
     prior_design: Array,
     noise_m: float,
     most_unusual: float = np.inf,
-    near: LearnedErrors | None = None,
+    near: Mapping[str, float] = MappingProxyType({}),
 ) -> LearnedErrors:
     """Learn the sizes of the components of the errors of c bins, as ``learnt_sizes``.
 
@@ -111,11 +112,11 @@ def learn_errors(
         noise_m: standard deviation of single ranges.
         most_unusual: largest standard deviation of a radio's error above its median, in spreads over radios. A map may
             bend by any amount.
-        near: errors of nearly the same problem, to start from.
+        near: sizes in nearly the same problem to start from, by name.
     """
     given = widened(components, noise_m)
     most = {each.name: most_unusual for each in given if each.name not in BENDS}
-    sizes = learnt_sizes(given, off_m, design, prior_design, most, None if near is None else near.stddev_of_component)
+    sizes = learnt_sizes(given, off_m, design, prior_design, most, near)
     off = [np.log(sizes[each.name] / each.median) / each.spread for each in given if each.spread > 0]
     learned = LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)
     return replace(learned, unlikeliness=float(np.sum(np.square(off))))

@@ -59,7 +59,7 @@ def _bent(on_map: RangesOnMap) -> RangesOnMap:
     for num in range(MAX_NUM_ROUNDS):
         if num:
             again = linearized(on_map) if num < _NUM_BINNED_ANEW else problem.at_other_map(on_map)
-            problem = again.with_learnt_errors(near=problem.errors)
+            problem = again.with_learnt_errors(near=problem.errors.stddev_of_component)
         before, on_map = on_map, _bent_once(problem)
         if is_nearly_at(on_map, before, problem.scatter_m):
             break
@@ -69,7 +69,7 @@ def _bent(on_map: RangesOnMap) -> RangesOnMap:
 def as_given(on_map: RangesOnMap) -> RangesOnMap:
     """Return the map before it was bent to the ranges, at the same state."""
     walk = on_map.bending
-    if not isinstance(walk, WalkBending) or walk.steps is None:
+    if not isinstance(walk, WalkBending) or not walk.is_corrected:
         return on_map
     return _on_path(on_map, walk, WalkBending(walk.given))
 
@@ -77,7 +77,7 @@ def as_given(on_map: RangesOnMap) -> RangesOnMap:
 def bends_m(on_map: RangesOnMap) -> Array:
     """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
     walk, scale = on_map.bending, on_map.state.metric_from_model.scale
-    if not isinstance(walk, WalkBending) or walk.steps is None:
+    if not isinstance(walk, WalkBending) or not walk.is_corrected:
         return np.zeros(0)
     return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))
 

@@ -14,7 +14,7 @@ from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
-from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, finite, row_of_mistake
+from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, row_of_mistake
 from rangesfm.util.geometry.numerics import UNDETERMINED
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
@@ -174,13 +174,9 @@ def row_of(test: Test) -> MistakeTest:
         hypothesis.unit,
     )
     if words:
-        row = replace(row, size=None, stddev=None)
-    return replace(
-        row,
-        effect_on_place_m=finite(test.effect_on_place_m),
-        redundancy=test.redundancy,
-        is_checked=test.is_checked,
-    )
+        row = replace(row, size=np.nan, stddev=np.nan)
+    place_m, redundancy = test.effect_on_place_m, test.redundancy
+    return replace(row, effect_on_place_m=place_m, redundancy=redundancy, is_checked=test.is_checked)
 
 
 def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:

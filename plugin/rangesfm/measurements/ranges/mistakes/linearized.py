@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -91,12 +92,14 @@ class Linearized(LinearMap):
         anchors: list[int] = np.unique(self.bins.anchor_index).tolist()
         return anchors
 
-    def with_learnt_errors(self, mistakes: Sequence[Array] = (), near: LearnedErrors | None = None) -> Linearized:
+    def with_learnt_errors(
+        self, mistakes: Sequence[Array] = (), near: Mapping[str, float] = MappingProxyType({})
+    ) -> Linearized:
         """Return the problem with the errors learnt while mistakes explain what they can.
 
         Args:
             mistakes: (c + r, k) effects of each on the residuals.
-            near: errors of nearly the same problem, to start from, which takes half the time.
+            near: sizes of the errors in nearly the same problem to start from, by name, which takes half the time.
         """
         columns = np.hstack([np.vstack([self.design, self.prior_design]), *mistakes])
         # Residuals are taken where the priors' residuals are smallest, with the map as it is.

@@ -26,6 +26,7 @@ from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP
+from rangesfm.util.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,12 @@ class RangeEstimate:
     def begun(cls, observations: RangeObservations, range_model: RangeModelOptions) -> RangeEstimate:
         """Return what is known of a log before its ranges are used."""
         return cls(observations, RangeErrors.begin(observations, observations.placed_rows, range_model))
+
+    def predicted_m(self, metric_from_sfm: Similarity) -> Array:
+        """Return the (n,) ranges that a placement of the unscaled path predicts, metres; NaN without a place."""
+        anchors_m = np.array([anchor.position_m for anchor in self.anchors]).reshape(-1, 3)
+        biases_m = np.array([anchor.range_bias_m for anchor in self.anchors])
+        return self.observations.predicted_m(metric_from_sfm, anchors_m, biases_m)
 
 
 # An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.

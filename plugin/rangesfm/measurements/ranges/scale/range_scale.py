@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_kinds
-from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.kind import Block, Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
@@ -26,7 +26,7 @@ from rangesfm.measurements.ranges.scale.doubts import (
     remarks_on_anchors,
     remarks_on_places,
 )
-from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, predicted_ranges, solve
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, solve
 from rangesfm.measurements.ranges.scale.range_estimate import (
     RangeEstimate,
     anchor_estimates,
@@ -83,11 +83,6 @@ class RangeScale(KindOnMap):
         return binned_ranges(self.posed, self.solution, max_num)
 
     @property
-    def predicted_m(self) -> Array:
-        """The (k,) predicted ranges."""
-        return predicted_ranges(self.solution.problem, self.solution.fit.state)
-
-    @property
     def start(self) -> Similarity:
         """The placement of the solution."""
         placed = self.solution.fit.state.metric_from_model
@@ -119,7 +114,8 @@ class RangeScale(KindOnMap):
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""
-        return problem.posterior(formal=self.solution.fit.log_scale_stddev)
+        linear, noise = problem.among(problem.is_used)
+        return Posterior.best(linear, noise, self.solution.fit.log_scale_stddev)
 
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
         """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
@@ -228,10 +224,11 @@ class RangeScale(KindOnMap):
         del by_kind
         return diagnose_ranges(self.on(on_map), seed=self.posed.given.seed)
 
-    def moved_ranges(self, known: Posterior, bent: FrameSteps) -> Iterator[tuple[Array, Indices, Array]]:
-        """Yield the moved anchors, and by how much longer the ranges are."""
-        after = self.moved(known, bent)
-        yield after.solution.fit.state.anchors_m, after.posed.rows, after.predicted_m - self.predicted_m
+    @property
+    def blocks(self) -> Mapping[Block, Array]:
+        """Positions of the anchors."""
+        names = self.posed.observations.log.anchor_ids
+        return {("anchor", name): at for name, at in zip(names, self.solution.fit.state.anchors_m, strict=True)}
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield the faults of the path, of the anchors and of the ranges."""
