@@ -204,7 +204,6 @@ def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
         model.reconstruction,
         CameraOptions(),
         RefineOptions(max_num_iterations=77),
-        fixed_frame_id=None,
         num_threads=1,
     )
     assert changes(bundle.adjuster.options) == {

@@ -35,9 +35,7 @@ def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:
     before = {point_id: (point.xyz.copy(), point.track.length()) for point_id, point in model.points3D.items()}
     num_seen = {image_id: image.num_points3D for image_id, image in model.images.items()}
     left_out = sorted(before)[2:5]
-    bundle = bundle_adjustment(
-        model, CameraOptions(), RefineOptions(), fixed_frame_id=None, num_threads=1, left_out_ids=left_out
-    )
+    bundle = bundle_adjustment(model, CameraOptions(), RefineOptions(), num_threads=1, left_out_ids=left_out)
     problem = bundle.adjuster.problem
     takes_part = {point_id for point_id, point in model.points3D.items() if problem.has_parameter_block(point.xyz)}
     assert takes_part == before.keys() - set(left_out)
@@ -52,7 +50,7 @@ def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:
 
 
 def a_bundle(model: pycolmap.Reconstruction | None = None, **options: Any) -> BundleAdjustment:
-    given = {"camera": CameraOptions(), "options": RefineOptions(), "fixed_frame_id": None, "num_threads": 1}
+    given = {"camera": CameraOptions(), "options": RefineOptions(), "num_threads": 1}
     return bundle_adjustment(orbit() if model is None else model, **{**given, **options})
 
 

@@ -63,7 +63,7 @@ def test_of_several_tables_each_camera_has_its_own_or_none() -> None:
     kept = CameraOptions(images="camera000001*", model=model_name, params=params, focal_length_stddev_px=0.0)
     drawn = CameraOptions(images="camera000002*", model=model_name, params=params, focal_length_stddev_px=5.0)
     camera = CameraOptions(others=(kept, drawn))
-    bundle = bundle_adjustment(model, camera, RefineOptions(max_num_iterations=1), fixed_frame_id=None, num_threads=1)
+    bundle = bundle_adjustment(model, camera, RefineOptions(max_num_iterations=1), num_threads=1)
     problem, before = bundle.adjuster.problem, bundle.adjuster.problem.num_residuals()
     add_calibration(bundle, camera)
     assert problem.num_residuals() == before + len(params)

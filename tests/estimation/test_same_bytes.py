@@ -23,7 +23,7 @@ def test_more_residuals_than_colmap_gives_to_one_thread_are_added_up_by_one() ->
         rescale(made.reconstruction, made.metric_from_sfm),
         CameraOptions(),
         RefineOptions(max_num_iterations=1),
-        fixed_frame_id=1,
+        fixed_frame_ids=(1,),
         num_threads=2,
     )
     problem, adjuster = bundle.adjuster.problem, bundle.adjuster

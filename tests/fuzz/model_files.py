@@ -137,7 +137,7 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
         write_points(metric, Path(folder) / "points.ply")
     with contextlib.suppress(RangesfmError):
         options = RefineOptions(max_num_iterations=2)
-        problem = bundle_adjustment(metric, CameraOptions(), options, fixed_frame_id=None, num_threads=1)
+        problem = bundle_adjustment(metric, CameraOptions(), options, num_threads=1)
         solve_bundle_adjustment(problem, tolerance_m=1e-3)
 
 

@@ -69,9 +69,7 @@ def test_the_compiled_cost_is_that_of_the_weights(name: str, scene: Scene) -> No
     model, kind = pycolmap.Reconstruction(scene.model), scene.kinds[name]
     camera = CameraOptions(refine_intrinsics=False)
     ids = add_marks(model, scene.markers)
-    adjustment = bundle_adjustment(
-        model, camera, RefineOptions(), fixed_frame_id=None, num_threads=1, marker_ids=ids.values()
-    )
+    adjustment = bundle_adjustment(model, camera, RefineOptions(), num_threads=1, marker_ids=ids.values())
     blocks = {block: at.copy() for block, at in scene.state.blocks.items()}
     blocks |= {("mark", mark): model.point3D(id_).xyz for mark, id_ in ids.items()}
     poses = [pose_of(model.frame(int(frame_id))).params for frame_id in scene.path.frame_ids]

@@ -123,7 +123,7 @@ def test_what_a_run_did_not_leave_is_empty_or_none(tmp_path: Path) -> None:
     result = read_result_folder(write_document(tmp_path))
     assert [len(result.read(table)) for table in RESULT_TABLES] == [0] * len(RESULT_TABLES)
     assert (len(result.read_reference()), result.read_metric_model()) == (0, None)
-    assert (result.timestamps_s, result.images_path) == (None, None)
+    assert (result.timestamps_s, result.images_path) == ({}, None)
 
 
 def test_times_and_ranges_are_read_as_they_stand(tmp_path: Path) -> None:

@@ -57,7 +57,6 @@ def test_the_refinement_of_a_long_path_is_direct() -> None:
         walk(1010, 6).reconstruction,
         CameraOptions(),
         RefineOptions(max_num_iterations=1),
-        fixed_frame_id=None,
         num_threads=1,
     )
     assert problem.adjuster.options.ceres.max_num_images_direct_sparse_cpu_solver == 1010

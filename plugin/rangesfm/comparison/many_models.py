@@ -187,7 +187,7 @@ def _photo_times(models: Mapping[Path, NamedModel], survey: Survey) -> dict[str,
     with suppress(InputError):  # the names of the photos are no times
         times_s.update(times_of_model(survey, first.model, path).by_name())
     for result in filter(None, map(_result_around, models)):
-        times_s.update(result.timestamps_s or {})
+        times_s.update(result.timestamps_s)
     return times_s
 
 

@@ -84,7 +84,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         tags_in_cam_m=dict(zip(tag_ids, result.lever_arms_m(tag_ids), strict=True)),
         anchors_m=anchors,
         biases_m={id_: result.summary.anchors[id_].range_bias_m or 0.0 for id_ in anchors},
-        image_times_s=result.timestamps_s or {},
+        image_times_s=result.timestamps_s,
         metric_path=metric_path,
         association=result.summary.settings.ranges.association,
     )

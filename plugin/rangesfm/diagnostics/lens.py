@@ -159,7 +159,7 @@ def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
         bundle_adjustment={**lens, "refine_sensor_from_rig": False, "ceres": ceres_options},
     )
     frame_id = min(model.reg_frame_ids())
-    adjuster = bundle_adjustment(model, CameraOptions(), options, fixed_frame_id=frame_id, num_threads=1).adjuster
+    adjuster = bundle_adjustment(model, CameraOptions(), options, fixed_frame_ids=(frame_id,), num_threads=1).adjuster
     if adjuster.problem.num_residuals() <= adjuster.problem.num_parameters():
         raise SolverError("the photos see too few points to tell anything of the lens")
     summary = solver.solve_adjuster(adjuster, lambda step: False)

@@ -14,6 +14,7 @@ from rangesfm.colmap.transform import transform
 from rangesfm.estimation.free_fit import GraphSolution, KeyframeGraph, local_scales, solve_graph, with_gradient
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.vision_information import (
+    NO_LOOPS,
     LoopPoses,
     Observations,
     VisionInformation,
@@ -127,7 +128,7 @@ def _moved(problem: MapProblem, rays: Observations, graph: KeyframeGraph, fit: G
 
 
 def _graph(
-    problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array], loops: LoopPoses | None = None
+    problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array], loops: LoopPoses = NO_LOOPS
 ) -> KeyframeGraph:
     """Set up the keyframe graph of the current model.
 
@@ -141,7 +142,8 @@ def _graph(
     if problem.is_refined:
         vision = with_gradient(vision, photo_gradient(seen, poses))
     own = {name: at for name, at in blocks.items() if name[0] != "mark"}  # here marks are where their rays meet
-    return KeyframeGraph(vision if loops is None else vision.with_loops(loops), problem.kinds, problem.held_frame, own)
+    vision = vision.with_loops(loops) if len(loops.frame) else vision
+    return KeyframeGraph(vision, problem.kinds, problem.held_frame, own)
 
 
 def _move(problem: MapProblem, rays: Observations, vision: VisionInformation, after: Poses) -> None:

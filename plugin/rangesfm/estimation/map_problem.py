@@ -125,7 +125,7 @@ class MapProblem:
             self.metric,
             self.camera,
             self.options.changed(max_num_iterations=max_num_iterations),
-            fixed_frame_id=int(self.timed_ids[0]) if self.first_pose_is_fixed else None,
+            fixed_frame_ids=self.timed_ids[:1].tolist() if self.first_pose_is_fixed else (),
             num_threads=self.num_threads,
             marker_ids=self.marker_ids.values(),
             left_out_ids=self.left_out_ids - set(self.marker_ids.values()),

@@ -137,9 +137,7 @@ def bending_of_model(
         frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
         rays = model_observations(model, frame_ids)
         misplaced = rays.point_ids[misplaced_points(rays, model_poses(model, frame_ids))]
-        bundle = bundle_adjustment(
-            model, camera, options, fixed_frame_id=None, num_threads=num_threads, left_out_ids=misplaced.tolist()
-        )
+        bundle = bundle_adjustment(model, camera, options, num_threads=num_threads, left_out_ids=misplaced.tolist())
         if bundle.has_covariance:
             equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
             firm_ids = frames_of_largest_part(model)

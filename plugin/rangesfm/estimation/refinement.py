@@ -41,6 +41,9 @@ _MAX_NUM_ROUNDS = 3
 # Largest movement of a keyframe left at the end, as a share of the smallest standard deviation of a measurement.
 _MAX_LAST_MOVEMENT = 0.01
 
+MergeTracks = Callable[[pycolmap.Reconstruction], None]
+"""Makes one point of those that two passes saw apart, in place."""
+
 
 @dataclass(frozen=True)
 class MapAtRest:
@@ -124,7 +127,7 @@ def refine_with_loops(
     problem: MapProblem,
     known: MapProblem,
     loops: LoopPoses,
-    merge_tracks: Callable[[pycolmap.Reconstruction], None],
+    merge_tracks: MergeTracks,
     *,
     with_equations: bool = True,
 ) -> MapAtRest | None:
@@ -133,7 +136,6 @@ def refine_with_loops(
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
         loops: measured relative poses, by ids of frames in place of indices.
-        merge_tracks: makes one point of those that two passes saw apart, in place.
         with_equations: as for ``refine``.
     """
     place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}

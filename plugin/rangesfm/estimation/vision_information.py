@@ -93,6 +93,10 @@ class LoopPoses:
     information: Array
 
 
+_NONE = np.zeros(0, dtype=np.int64)
+NO_LOOPS = LoopPoses(_NONE, _NONE, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
+
+
 @dataclass(frozen=True)
 class VisionInformation:
     """Gaussian information on u relative poses (6 numbers each: turn, shift), linearised at ``origin``.
@@ -102,7 +106,7 @@ class VisionInformation:
         reference, frame: (u,) pose of keyframe ``frame`` relative to keyframe ``reference``.
         matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
         from_optimum: (6 u,) relative poses at the origin, minus those at which the photos fit best.
-        loops: the last of the relative poses, which are not as at the origin; None without any.
+        loops: the last of the relative poses, which are not as at the origin.
     """
 
     origin: Poses
@@ -110,7 +114,7 @@ class VisionInformation:
     frame: Indices
     matrix: sparse.bsr_array
     from_optimum: Array
-    loops: LoopPoses | None = None
+    loops: LoopPoses = NO_LOOPS
 
     def with_loops(self, loops: LoopPoses) -> VisionInformation:
         """Return a copy with further relative poses."""
@@ -129,13 +133,12 @@ class VisionInformation:
     @property
     def num_from_points(self) -> int:
         """Return the number of relative poses that are not loops."""
-        return len(self.reference) - (0 if self.loops is None else len(self.loops.reference))
+        return len(self.reference) - len(self.loops.reference)
 
     def measured(self) -> tuple[Array, Array]:
         """Return the (u, 3, 3) turns and (u, 3) shifts at the origin, and of loops as they were measured."""
         turn, shift = relative_poses(self.origin, self.reference, self.frame)
-        if self.loops is not None:
-            turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
+        turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
         return turn, shift
 
 

@@ -120,7 +120,7 @@ def export_model(
     Raises:
         InputError: a format is unknown or needs something that is not given, or the folder cannot be written to.
     """
-    map_ = MetricMap(reconstruction, timestamps_s, anchors_m or {}, metric_from_sfm)
+    map_ = MetricMap(reconstruction, timestamps_s or {}, anchors_m or {}, metric_from_sfm)
     return export_map(map_, Path(output_path), ExportOptions(formats=tuple(formats)))
 
 

@@ -54,7 +54,7 @@ class MetricMap:
     """
 
     reconstruction: pycolmap.Reconstruction
-    timestamps_s: Mapping[str, float] | None = None
+    timestamps_s: Mapping[str, float] = field(default_factory=dict)
     anchors_m: Mapping[str, Array] = field(default_factory=dict)
     metric_from_sfm: Similarity | None = None
     relative_scale_stddev: float = math.inf
@@ -68,7 +68,7 @@ class MetricMap:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
+        return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s or None)
 
     @property
     def known_up(self) -> Array | None:

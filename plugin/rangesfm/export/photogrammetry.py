@@ -155,7 +155,7 @@ def _camera(camera: pycolmap.Camera) -> dict[str, Any]:
 
 def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
     cam_from_world = image.cam_from_world()
-    time = (map_.timestamps_s or {}).get(image.name)
+    time = map_.timestamps_s.get(image.name)
     return {
         "camera": str(image.camera_id),
         "rotation": Rotation.from_matrix(cam_from_world.rotation.matrix()).as_rotvec().tolist(),

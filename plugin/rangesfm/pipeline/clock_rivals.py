@@ -34,12 +34,12 @@ def by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Riv
 
     def at_ranges_offset(other: TimeOffset) -> ScaleEstimate:
         observations = run.ranges_on(trajectory, replace(path, time_offset=other).offset_s)
-        return run.estimate_scale(replace(path, observations=observations))
+        return run.estimate_scale(replace(path, observations=observations), path.as_walk)
 
     def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
         antenna = track and replace(track, offset=other)
         positions = replace(run.inputs.positions, antenna=antenna)
-        return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path)
+        return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path, path.as_walk)
 
     found = list[Rivals]()
     if offset is not None and offset.rivals:

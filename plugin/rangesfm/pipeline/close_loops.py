@@ -21,10 +21,10 @@ from rangesfm.colmap.reprojection import point_errors
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
-from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.refinement import MapAtRest, MergeTracks, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.refine_map import MergeTracks, refine_closed_map
+from rangesfm.pipeline.refine_map import refine_closed_map
 from rangesfm.progress import Journal, Progress
 from rangesfm.result.result_folder import RESULT_NAMES
 from rangesfm.sfm.loop_database import LoopMatching, Pair, has_closed_loops

@@ -118,7 +118,7 @@ def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -
         run = run.changed({"scale.up_in_first_camera": None})
     tape = distances_within(locatable(run.inputs.tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
     run = replace(run, inputs=replace(run.inputs, anchor_frame=frame, tape=tape))
-    estimate = run.estimate_scale(part)
+    estimate = run.estimate_scale(part, part.as_walk)
     is_given = frame == "first_camera"
     return ScaledModel(
         part.trajectory, estimate, is_in_anchor_frame=is_given or estimate.frame == "site", frame_is_given=is_given

@@ -204,7 +204,7 @@ def _camera_times_s(survey: FinishedRun) -> Array:
     follows from the time offset.
     """
     ranges, times = survey.ranges, survey.result.timestamps_s
-    if times is None:
+    if not times:
         return np.full(len(ranges.range_m), np.nan)
     offset = survey.result.summary.time_offset.value_s or 0.0
     before, after = (

@@ -75,7 +75,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
     # Which measurements contradict the others depends on how far the photos let the map drift.
-    bending = None if is_a_start and not inputs.may_be_left_out else bending_by_survey(survey, path)
+    bending = path.as_walk if is_a_start and not inputs.may_be_left_out else bending_by_survey(survey, path)
     limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)

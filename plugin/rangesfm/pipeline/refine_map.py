@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from rangesfm.estimation.drift import bend
 from rangesfm.estimation.map_posterior import errors_at_estimate, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import by_photos
-from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.refinement import MapAtRest, MergeTracks, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import refined_ranges, summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
@@ -31,9 +30,6 @@ from rangesfm.util.geometry.poses import model_poses
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.util.processes.threads import at_most
-
-MergeTracks = Callable[[pycolmap.Reconstruction], None]
-"""Makes one point of those that two passes saw apart, in place."""
 
 
 def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:

@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Mask, median, rms
+from rangesfm.arrays import Array, Mask, median, rms
 from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.errors import number_text
-from rangesfm.estimation.scale.scale_estimate import scale_diagnostics
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.positions.control_points import locate_points
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
+from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
+from rangesfm.measurements.ranges.scale.two_candidate import two_candidate
 from rangesfm.pipeline.metric_result import MetricResult, ModelVerdict
 from rangesfm.result import entries
 from rangesfm.result.result_tables import (
@@ -37,7 +39,9 @@ from rangesfm.result.result_tables import (
 )
 from rangesfm.result.summary import ResultSummary
 from rangesfm.solver.mistakes import RISK
+from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
 _DISAGREES = 3.0
@@ -287,12 +291,40 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         yield TagCorners(tuple(names), tuple(photos), *pixels.T)
     if len(found.observations.log):
         yield ranges_as_used(found)
-        diagnostics, log = scale_diagnostics(found.estimate, found.trajectory), found.observations.log
-        rows = diagnostics.candidate_rows
-        times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
-        anchor_ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
-        yield ScaleCandidates(times, anchor_ids, *diagnostics.candidates.T)
-        yield ScaleConsensus(diagnostics.curve_scales, diagnostics.num_agreeing.astype(np.float64))
+        yield from _tables_of_scale(found.estimate, found.trajectory)
+
+
+def _tables_of_scale(estimate: ScaleEstimate, path: Trajectory) -> Iterator[TableFile]:
+    """Yield the paper's candidates, and how many ranges agree with each scale, with anchors and rotation held fixed.
+
+    Args:
+        path: of the unscaled model.
+    """
+    observations, log, placed = estimate.observations, estimate.observations.log, estimate.metric_from_sfm
+    anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
+    rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
+    tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
+
+    def about(held: Array) -> tuple[Array, Array]:
+        """Return centres in SfM units and anchors in metres, both along the metric axes and relative to a place."""
+        return (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
+
+    # In the paper the first camera is the origin.
+    centers, anchor_m = about(path.centers[0])
+    table = two_candidate(centers, tags, anchor_m, range_m)
+    seen, duplets = (rows[:0], np.zeros((0, 2))) if table is None else (rows[table.rows], table.duplets)
+    times = np.full(len(seen), np.nan) if log.timestamp_s is None else log.timestamp_s[seen]
+    yield ScaleCandidates(times, tuple(log.anchor_ids[k] for k in log.anchor_index[seen]), *duplets.T)
+    # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
+    centers, anchor_m = about(path.centers.mean(axis=0) if estimate.frame == "site" else path.centers[0])
+    bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
+    tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
+    starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
+    # From a third of the estimate to three times it.
+    scales = placed.scale * np.geomspace(1 / 3, 3, 601)
+    num_begun = np.searchsorted(np.sort(starts), scales, side="right")
+    num_agreeing = num_begun - np.searchsorted(np.sort(ends), scales, side="left")
+    yield ScaleConsensus(scales, num_agreeing.astype(np.float64))
 
 
 def ranges_as_used(found: MetricResult) -> RangesAsUsed:

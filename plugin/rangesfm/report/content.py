@@ -86,7 +86,7 @@ class Content:
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(self.ranges.tag_id)
-        of_photos = result.timestamps_s or {}
+        of_photos = result.timestamps_s
         times = np.array([of_photos.get(name, np.nan) for name in self.ranges.image_name], dtype=np.float64)
         times = np.where(np.isfinite(self.ranges.timestamp_s), self.ranges.timestamp_s, times)
         self.range_times_s = times - np.min(times, initial=np.inf, where=np.isfinite(times))

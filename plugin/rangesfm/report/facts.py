@@ -54,7 +54,7 @@ def _anchors(content: Content) -> str:
 
 def _when(content: Content) -> str:
     """Return date and times of the photos; empty where they have no times, or their clock does not tell the date."""
-    times_s = [time for time in (content.result.timestamps_s or {}).values() if np.isfinite(time)]
+    times_s = [time for time in content.result.timestamps_s.values() if np.isfinite(time)]
     if not times_s or not all(map(are_seconds_since_1970, times_s)):
         return ""
     begin, end = (datetime.fromtimestamp(time, timezone.utc) for time in (min(times_s), max(times_s)))

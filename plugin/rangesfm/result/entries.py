@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
+from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.measurements.ranges.scale.two_candidate import Branch
 from rangesfm.options import COORDINATE_M, RangesOptions
 from rangesfm.util.files.records import (
@@ -85,24 +86,6 @@ class ScaleByKindEntry(Record):
 
     value: Number
     stddev: NumberOrNull
-
-
-class ScaleSensitivity(Record):
-    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
-
-    Attributes:
-        common_bias_per_cm: if all ranges were a centimetre longer.
-        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
-        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
-        range_slope_per_percent: if all ranges were one percent longer.
-        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
-    """
-
-    common_bias_per_cm: float
-    short_range_per_cm: float
-    anchor_bias_per_cm: dict[str, float]
-    range_slope_per_percent: float
-    lever_arm_per_cm: tuple[float, float, float]
 
 
 class ScaleEntry(Record):

@@ -83,12 +83,12 @@ class ResultFolder:
 
     Attributes:
         summary: content of ``result.json``.
-        timestamps_s: time of each photo by name; None where the photos have no times.
+        timestamps_s: time of each photo by name; empty where the photos have no times.
     """
 
     path: Path
     summary: ResultSummary
-    timestamps_s: dict[str, float] | None
+    timestamps_s: dict[str, float]
 
     @property
     def anchor_positions_m(self) -> dict[str, Array]:
@@ -141,7 +141,7 @@ class ResultFolder:
         Raises:
             InputError: the result has photo times, but none for a photo of the model.
         """
-        path = trajectory_from_reconstruction(model, self.timestamps_s)
+        path = trajectory_from_reconstruction(model, self.timestamps_s or None)
         if not len(path) and model.num_reg_images():
             raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", self.path)
         return path
@@ -173,5 +173,4 @@ def read_result_folder(path: Path) -> ResultFolder:
     if not result_path.is_file():
         raise InputError("not a result folder: it has no result.json (expected the output_path of a run)", path)
     summary, times = ResultSummary.read(result_path), PhotoTimes.read(path)
-    by_name = dict(zip(times.image_name, times.timestamp_s.tolist(), strict=True))
-    return ResultFolder(path, summary, by_name if (path / PhotoTimes.NAME).is_file() else None)
+    return ResultFolder(path, summary, dict(zip(times.image_name, times.timestamp_s.tolist(), strict=True)))

@@ -18,6 +18,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.place import Place
 from rangesfm.errors import number_text
+from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.result import entries
 from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.util.files.records import NumberOrNull, Record, Text
@@ -192,7 +193,7 @@ def _closed(loops: entries.LoopsEntry) -> str:
     )
 
 
-def _notable(sensitivity: entries.ScaleSensitivity) -> Iterator[str]:
+def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
     """Yield a line that names the errors of which one centimetre changes the scale much, if there are any."""
     values = {
         "of error in the short ranges": sensitivity.short_range_per_cm,

@@ -129,14 +129,15 @@ def bundle_adjustment(
     camera: CameraOptions,
     options: RefineOptions,
     *,
-    fixed_frame_id: int | None,
     num_threads: int,
+    fixed_frame_ids: Collection[int] = (),
     marker_ids: Collection[int] = (),
     left_out_ids: Collection[int] = (),
 ) -> BundleAdjustment:
     """Set up the bundle adjustment, with a gauge that leaves the scale free for the ranges.
 
     Args:
+        fixed_frame_ids: of the frames whose poses are held.
         marker_ids: 3-D points that must not serve as tie points, as other residuals are added to them.
         left_out_ids: 3-D points that do not take part and keep their positions.
 
@@ -145,7 +146,7 @@ def bundle_adjustment(
         InputError: an option passed through to COLMAP is unknown.
     """
     with _without_points(metric, left_out_ids):
-        adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, num_threads)
+        adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_ids, num_threads)
     num_reprojections = adjuster.problem.num_residuals()
     if num_reprojections == 0:
         raise SolverError("no point of the model takes part in the bundle adjustment")
@@ -270,7 +271,7 @@ def _bundle_adjuster(
     metric: pycolmap.Reconstruction,
     camera: CameraOptions,
     options: RefineOptions,
-    fixed_frame_id: int | None,
+    fixed_frame_ids: Collection[int],
     num_threads: int,
 ) -> pycolmap.CeresBundleAdjuster:
     ba = pycolmap.BundleAdjustmentOptions(print_summary=False)
@@ -300,8 +301,8 @@ def _bundle_adjuster(
         if any(refines) and not camera.of_photo(image.name).refinement_refines_intrinsics:
             config.set_constant_cam_intrinsics(image.camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
-    if fixed_frame_id is not None:
-        config.set_constant_rig_from_world_pose(fixed_frame_id)
+    for frame_id in fixed_frame_ids:
+        config.set_constant_rig_from_world_pose(frame_id)
     return pycolmap.create_default_ceres_bundle_adjuster(ba, config, metric)
 
 

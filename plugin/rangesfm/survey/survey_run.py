@@ -54,6 +54,11 @@ class PathOfModel:
         times_s = self.observations.log.timestamp_s
         return 0.0 if self.time_offset is None or times_s is None else self.time_offset.at(times_s)
 
+    @property
+    def as_walk(self) -> WalkBending:
+        """How the model is bent if it drifts as a map of poses does."""
+        return WalkBending(in_first_camera(self.trajectory))
+
 
 @dataclass(frozen=True)
 class SurveyRun:
@@ -130,16 +135,16 @@ class SurveyRun:
             raise InputError(why, options.path)
         return hold_out(placed, options, self.survey.output.seed)
 
-    def estimate_scale(self, path: PathOfModel, bending: MapBending | None = None) -> ScaleEstimate:
+    def estimate_scale(self, path: PathOfModel, bending: MapBending) -> ScaleEstimate:
         """Estimate the scale of a model by all that the survey has measured in it.
 
         Args:
-            bending: how the map is bent; None: it drifts as a map of poses does.
+            bending: how the map is bent.
 
         Raises:
             GeometryError: the scale is not determined.
         """
-        bending, log = bending or WalkBending(in_first_camera(path.trajectory)), path.observations
+        log = path.observations
         at = MapOfPhotos(path.sfm, path.trajectory, bending, self.survey, log)
         located, remarks = kinds_in_map(self.inputs, at)
         if not located:

@@ -25,9 +25,10 @@ from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDi
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.range_estimate import NOT_KNOWN, RangeEstimate
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
+from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS

@@ -1,4 +1,4 @@
-"""ScaleEstimate: the result of the scale stage, with its verdict in a surveyor's words, and tables to plot of it."""
+"""ScaleEstimate: the result of the scale stage, with its verdict in a surveyor's words."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate, ScaleSensitivity
-from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
-from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
-from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95, NOTHING_KNOWN, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95, NOTHING_KNOWN
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -256,49 +255,3 @@ class ScaleEstimate:
         """Return the scale with its interval and its verdict on one line."""
         low, high = self.interval_95
         return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"
-
-
-@dataclass(frozen=True)
-class ScaleDiagnostics:
-    """Tables beside a ScaleEstimate; all scales are in metres per SfM unit.
-
-    Attributes:
-        candidate_rows: (k,) rows of the log whose ranges have candidates.
-        candidates: (k, 2) the smaller and the larger candidate of each.
-        curve_scales: (m,) increasing scales, from a third of the estimate to three times it.
-        num_agreeing: (m,) number of ranges that agree with each scale.
-    """
-
-    candidate_rows: Indices
-    candidates: Array
-    curve_scales: Array
-    num_agreeing: Indices
-
-
-def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleDiagnostics:
-    """Return the tables of an estimate on its unscaled path, with its anchors and its rotation held fixed."""
-    observations, log, placed = estimate.observations, estimate.observations.log, estimate.metric_from_sfm
-    anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
-    rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
-    tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
-
-    def about(held: Array) -> tuple[Array, Array]:
-        """Return centres in SfM units and anchors in metres, both along the metric axes and relative to a place."""
-        return (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
-
-    # In the paper the first camera is the origin.
-    centers, anchor_m = about(trajectory.centers[0])
-    table = two_candidate(centers, tags, anchor_m, range_m)
-    # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
-    centers, anchor_m = about(trajectory.centers.mean(axis=0) if estimate.frame == "site" else trajectory.centers[0])
-    bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
-    tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
-    starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
-    scales = placed.scale * np.geomspace(1 / 3, 3, 601)
-    num_begun = np.searchsorted(np.sort(starts), scales, side="right")
-    return ScaleDiagnostics(
-        candidate_rows=np.zeros(0, dtype=np.int64) if table is None else rows[table.rows],
-        candidates=np.zeros((0, 2)) if table is None else table.duplets,
-        curve_scales=scales,
-        num_agreeing=np.asarray(num_begun - np.searchsorted(np.sort(ends), scales, side="left")),
-    )

@@ -53,13 +53,13 @@ class Trajectory:
 
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
         """Return the path of the same keyframes in another model."""
-        return trajectory_from_reconstruction(model, self.times_by_name)
+        return trajectory_from_reconstruction(model, self.times_by_name or None)
 
     @property
-    def times_by_name(self) -> dict[str, float] | None:
-        """Times of the keyframes by name of the photo; None if unknown."""
+    def times_by_name(self) -> dict[str, float]:
+        """Times of the keyframes by name of the photo; empty if unknown."""
         times = self.timestamps_s
-        return None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
+        return {} if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
 
     def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
         """Return the keyframes whose photo has a time, in the order of these times, given by the photos' names."""

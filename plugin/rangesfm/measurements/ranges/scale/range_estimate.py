@@ -20,6 +20,7 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     solve,
 )
 from rangesfm.measurements.ranges.scale.scale_problem import MIN_RANGES, ScaleProblem
+from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, ScaleSensitivity
 from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.measurements.ranges.scale.starts import choose_sides
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
@@ -27,28 +28,6 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.util.geometry.similarity import Similarity
-
-
-@dataclass(frozen=True)
-class ScaleSensitivity:
-    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
-
-    Attributes:
-        common_bias_per_cm: if all ranges were a centimetre longer.
-        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
-        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
-        range_slope_per_percent: if all ranges were one percent longer.
-        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
-    """
-
-    common_bias_per_cm: float
-    short_range_per_cm: float
-    anchor_bias_per_cm: dict[str, float]
-    range_slope_per_percent: float
-    lever_arm_per_cm: tuple[float, float, float]
-
-
-NOT_KNOWN = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
 
 
 def scale_sensitivity(solution: Solution, posed: ScaleProblem, by_bins: Array, bins: RangeBins) -> ScaleSensitivity:
