@@ -60,6 +60,7 @@ from rangesfm.sfm.mapping import pipeline_options
 from rangesfm.sfm.matching import match_features, matching_options
 from rangesfm.sfm.photo_files import usable_photos
 from rangesfm.sfm.reconstruct import reconstruct
+from rangesfm.sfm.steps import Workspace
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
 
@@ -178,9 +179,9 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
     """Match the photos anew, and return the effort of matching alone."""
     clear_matches(database)
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
-    usable, log = usable_photos(photos, names), database.with_name("mapper.log")
-    with colmap_log(log) as log_folder:
-        return effort_of(lambda: match_features(database, usable, options, log_folder, Progress()))
+    usable, space = usable_photos(photos, names), Workspace(database.parent, Progress())
+    with space.logged():
+        return effort_of(lambda: match_features(space, usable, options))
 
 
 @dataclass(frozen=True)
@@ -272,7 +273,10 @@ def compare_processes(
 ) -> None:
     all_cores = len(os.sched_getaffinity(0))
     ways = [(1, 1), (1, all_cores), (num_threads, all_cores), (2 * num_threads, all_cores)]
-    databases = [Path(shutil.copy(features, features.with_name(f"{k}.db"))) for k in range(len(ways))]
+    spaces = [features.with_name(str(k)) for k in range(len(ways))]
+    for space in spaces:
+        space.mkdir()
+    databases = [Path(shutil.copy(features, space / "database.db")) for space in spaces]
     efforts: list[list[Effort]] = [[] for _ in ways]
     for _ in range(num_rounds):
         for of_way, database, (num_processes, num_cores) in zip(efforts, databases, ways, strict=True):

@@ -48,8 +48,8 @@ def leftmost_features(room: Room, masks: Path) -> list[float]:
         photo_matching(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, new) as matching,
     ):
         space = new.begin(matching.plan, with_loops_closed=False)
-        with space.logged() as log_folder:
-            matching.fill(space, log_folder)
+        with space.logged():
+            matching.fill(space)
         with pycolmap.Database.open(space.database) as database:
             return [float(database.read_keypoints(id_)[:, 0].min() / 256) for id_ in range(1, NUM_PHOTOS + 1)]
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.sfm.matches import content_of
 
-from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import Progress
@@ -21,6 +20,7 @@ from rangesfm.sfm.database import create_database
 from rangesfm.sfm.features import extract_features, feature_options
 from rangesfm.sfm.matching import match_features, matching_options
 from rangesfm.sfm.photo_files import Photos, usable_photos
+from rangesfm.sfm.steps import Workspace
 
 if TYPE_CHECKING:
     from tests.sfm.conftest import Listener, Room
@@ -36,7 +36,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}))
-    extract_features(room.folder / "database.db", photos, options, room.folder, Progress())
+    extract_features(Workspace(room.folder, Progress()), photos, options)
     return photos
 
 
@@ -55,8 +55,9 @@ def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def match(photos: Photos, database: Path, listener: Listener, num_processes: int) -> None:
     options = matching_options(MapperOptions(num_threads=num_processes), NUM_PHOTOS, seed=0)
-    with colmap_log(database.with_name("mapper.log")) as log_folder:
-        match_features(database, photos, options, log_folder, listener)
+    space = Workspace(database.parent, listener)
+    with space.logged():
+        match_features(space, photos, options)
 
 
 @pytest.mark.usefixtures("small_shares")

@@ -21,6 +21,7 @@ from rangesfm.sfm.matching import matching_options
 from rangesfm.sfm.pairs import pairing_options, pairs_to_match
 from rangesfm.sfm.photo_files import usable_photos
 from rangesfm.sfm.photos_alike import pairs_alike
+from rangesfm.sfm.steps import Workspace
 
 if TYPE_CHECKING:
     from tests.sfm.conftest import Room
@@ -42,10 +43,10 @@ def database(room: Room) -> Path:
     """A database with features of the rooms' photos."""
     photos = usable_photos(room.folder, room.names)
     cameras = cameras_of_photos(room.camera, photos)
-    path = room.folder / "alike.db"
+    path = room.folder / "database.db"
     create_database(path, room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}}))
-    extract_features(path, photos, options, path.parent, Progress())
+    extract_features(Workspace(path.parent, Progress()), photos, options)
     return path
 
 

@@ -112,7 +112,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
     options = mapping_options(camera, mapper, NO_RIGS, 0, database)
     photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
-    map_photos(Workspace(folder, Progress()), photos, options, folder)
+    map_photos(Workspace(folder, Progress()), photos, options)
 
 
 def cost_of(*arguments: object) -> tuple[float, float]:

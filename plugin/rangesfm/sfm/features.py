@@ -10,11 +10,11 @@ import pycolmap
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
-from rangesfm.progress import Progress
 from rangesfm.sfm.background import find_features
 from rangesfm.sfm.database import num_photos_with_features
 from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS, Photos
+from rangesfm.sfm.steps import Workspace
 from rangesfm.util.processes.supervision import run_child
 
 # A photo with fewer features is reported as poor. COLMAP starts from pairs with 100 matches and adds photos that see
@@ -36,11 +36,9 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
 
 
 def extract_features(
-    database_path: Path,
+    space: Workspace,
     photos: Photos,
     options: pycolmap.FeatureExtractionOptions,
-    log_folder: Path,
-    progress: Progress,
     mask_path: Path | None = None,
 ) -> None:
     """Find features in the photos of the database that have none yet, except where their masks are black.
@@ -51,14 +49,14 @@ def extract_features(
     Raises:
         ReconstructionError: fewer than two photos have enough features, or COLMAP failed.
     """
-    with pycolmap.Database.open(database_path) as database:
+    with pycolmap.Database.open(space.database) as database:
 
         def say_how_many(_: int) -> None:
-            progress.update(num_photos_with_features(database), len(photos.names))
+            space.progress.update(num_photos_with_features(database), len(photos.names))
 
         missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
         if missing:
-            work = partial(find_features, database_path, photos.folder, missing, mask_path, options, log_folder)
+            work = partial(find_features, space.database, photos.folder, missing, mask_path, options, space.log_folder)
             run_child(work, say_how_many)
         say_how_many(0)
         ids = enumerate(photos.names, 1)
@@ -70,7 +68,7 @@ def extract_features(
             f" is {poor[0]}: are the photos sharp, well exposed, and not of blank walls?"
         )
     if poor:
-        progress.message(
+        space.progress.message(
             f"{len(poor)} of {len(photos.names)} photos have fewer than {_MIN_NUM_FEATURES} features, the first is"
             f" {poor[0]}"
         )

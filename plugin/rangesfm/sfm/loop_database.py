@@ -15,7 +15,6 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Indices
-from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.progress import Progress
 from rangesfm.sfm.matching import MatchingOptions, match_pairs
@@ -111,8 +110,8 @@ class LoopMatching(Workspace):
     def match(self, pairs: list[Pair]) -> dict[Pair, Indices]:
         """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
         self._note_pairs(_LOOPS, {*_noted(self, _LOOPS), *pairs} - _noted(self, _TIES))
-        with colmap_log(self.log) as log_folder:
-            match_pairs(self.database, pairs, self.options, log_folder, self.progress)
+        with self.logged():
+            match_pairs(self, pairs, self.options)
         verified: dict[Pair, Indices] = {}
         with pycolmap.Database.open(self.database) as database:
             for pair in pairs:

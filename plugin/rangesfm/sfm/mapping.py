@@ -158,7 +158,7 @@ def mapping_options(
     return MappingOptions(growing, whole if is_due else None)
 
 
-def map_photos(space: Workspace, photos: Photos, options: MappingOptions, log_folder: Path) -> None:
+def map_photos(space: Workspace, photos: Photos, options: MappingOptions) -> None:
     """Map the photos of the database and write all models, the one with the most photos first.
 
     The incremental mapper continues from the newest snapshot, if there is one, and writes snapshots until it is done.
@@ -170,7 +170,7 @@ def map_photos(space: Workspace, photos: Photos, options: MappingOptions, log_fo
     if isinstance(growing, pycolmap.IncrementalPipelineOptions):
         models = _map_incrementally(space, photos, growing)
     else:
-        models = _map_in_child(space, photos.folder, growing, log_folder)
+        models = _map_in_child(space, photos.folder, growing)
     if whole is not None:
         for model in models:
             adjust_whole(space.database, model, options=whole)
@@ -225,7 +225,7 @@ def _num_registered(mapping: UnfinishedMapping) -> int:
 
 
 def _map_in_child(
-    space: Workspace, image_path: Path, mapper: WholePipelineOptions | ExternalMapper, log_folder: Path
+    space: Workspace, image_path: Path, mapper: WholePipelineOptions | ExternalMapper
 ) -> list[pycolmap.Reconstruction]:
     """Return all models of a mapper that takes all photos at once, in a process of its own.
 
@@ -235,14 +235,14 @@ def _map_in_child(
     with scratch_folder(space.folder / "mapping") as folder:
         database_path = Path(shutil.copyfile(space.database, folder / DATABASE_NAME))
         if isinstance(mapper, tuple):
-            return _map_by_program(space, folder, image_path, mapper, log_folder / "external_mapper")
+            return _map_by_program(space, folder, image_path, mapper)
         # It does not notice a cancellation, so that Ctrl-C ends its process.
-        run_child(partial(map_at_once, database_path, image_path, mapper, log_folder))
+        run_child(partial(map_at_once, database_path, image_path, mapper, space.log_folder))
         return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
 
 
 def _map_by_program(
-    space: Workspace, folder: Path, image_path: Path, mapper: ExternalMapper, log: Path
+    space: Workspace, folder: Path, image_path: Path, mapper: ExternalMapper
 ) -> list[pycolmap.Reconstruction]:
     """Return the models that an external mapper writes into a folder with a copy of the database.
 
@@ -250,7 +250,7 @@ def _map_by_program(
         ReconstructionError: it failed, wrote no model, or a model of other photos.
     """
     words = [word.replace("{images}", str(image_path.resolve())) for word in mapper]
-    name = f"the external mapper {Path(mapper[0]).name}"
+    name, log = f"the external mapper {Path(mapper[0]).name}", space.log_folder / "external_mapper"
     status = run_child(partial(run_program, words, folder, dict(os.environ), log))
     if status:
         how = f"status {status}" if status > 0 else signal.Signals(-status).name

@@ -22,6 +22,7 @@ from rangesfm.sfm.database import copy_matches, copy_photos, num_matching_pairs,
 from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
 from rangesfm.sfm.pairs import NamedPairs, PairingOptions, pairing_options, pairs_to_match
 from rangesfm.sfm.photo_files import Photos
+from rangesfm.sfm.steps import Workspace
 from rangesfm.util.files.atomic import scratch_folder
 from rangesfm.util.processes.supervision import run_children
 
@@ -99,26 +100,19 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
     return options
 
 
-def match_features(
-    database_path: Path, photos: Photos, options: MatchingOptions, log_folder: Path, progress: Progress
-) -> None:
+def match_features(space: Workspace, photos: Photos, options: MatchingOptions) -> None:
     """Match the pairs of photos that have not been matched yet; the number of processes does not change the result.
 
     Raises:
         ReconstructionError: no two photos match.
     """
-    match_pairs(database_path, pairs_to_match(database_path, photos, options.pairing), options, log_folder, progress)
-    _require_matches(database_path, photos)
+    match_pairs(space, pairs_to_match(space.database, photos, options.pairing), options)
+    _require_matches(space.database, photos)
 
 
-def match_pairs(
-    database_path: Path,
-    pairs: Sequence[tuple[int, int]],
-    options: MatchingOptions,
-    log_folder: Path,
-    progress: Progress,
-) -> None:
+def match_pairs(space: Workspace, pairs: Sequence[tuple[int, int]], options: MatchingOptions) -> None:
     """Match those of the pairs (ids of photos, smaller first) that have not been matched yet."""
+    database_path, progress = space.database, space.progress
     with pycolmap.Database.open(database_path) as database:
         missing = [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
     num_there = len(pairs) - len(missing)
@@ -130,7 +124,7 @@ def match_pairs(
             path = folder / f"{number}.db"
             copy_photos(database_path, path, sorted({image_id for pair in share for image_id in pair}))
             begun.append((path, share))
-            yield partial(match_share, path, share, options.matcher, options.verification, log_folder)
+            yield partial(match_share, path, share, options.matcher, options.verification, space.log_folder)
 
     def take_first() -> None:
         path, share = begun.popleft()
@@ -151,27 +145,27 @@ def match_pairs(
                     take_first()
 
 
-def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
+def verify_matches(space: Workspace, photos: Photos, options: MatchingOptions) -> None:
     """Verify the matches by two-view geometry, unless that is done.
 
     Raises:
         ReconstructionError: no two photos match.
     """
-    with pycolmap.Database.open(database_path) as database:
+    with pycolmap.Database.open(space.database) as database:
         num_pairs = database.num_matched_image_pairs()
         if database.num_verified_image_pairs() < num_pairs:
             run_in_background(
                 lambda token: pycolmap.geometric_verification(
-                    database_path,
+                    space.database,
                     options.verifier,
                     two_view_geometry_options=options.verification,
                     cancellation_token=token,
                 ),
-                progress,
+                space.progress,
                 database.num_verified_image_pairs,
                 num_pairs,
             )
-    _require_matches(database_path, photos)
+    _require_matches(space.database, photos)
 
 
 def _require_matches(database_path: Path, photos: Photos) -> None:

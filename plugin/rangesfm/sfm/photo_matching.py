@@ -88,20 +88,19 @@ class PhotoMatching:
         features = fingerprint(self.feature_inputs, self.cameras.inputs, contents, *self.rigs.inputs)
         return {"features": features, "matching": fingerprint(features, self.match_inputs)}
 
-    def fill(self, space: Workspace, log_folder: Path) -> None:
+    def fill(self, space: Workspace) -> None:
         """Find the features and matches that no earlier run has found, in the database of a workspace."""
-        photos, masks = self.photos, self.mapper.mask_path
         space.run(
             "features",
             self.plan["features"],
             partial(self._begin, space),
-            lambda: extract_features(space.database, photos, self.features, log_folder, space.progress, masks),
+            lambda: extract_features(space, self.photos, self.features, self.mapper.mask_path),
         )
         space.run(
             "matching",
             self.plan["matching"],
             partial(self._begin_matching, space),
-            partial(self._match, space, log_folder),
+            partial(self._match, space),
         )
 
     def _begin(self, space: Workspace) -> None:
@@ -132,11 +131,11 @@ class PhotoMatching:
             clear_matches(space.database)
         self._write_note(space)
 
-    def _match(self, space: Workspace, log_folder: Path) -> None:
+    def _match(self, space: Workspace) -> None:
         if self.has_matches:
-            verify_matches(space.database, self.photos, self.matching, space.progress)
+            verify_matches(space, self.photos, self.matching)
         else:
-            match_features(space.database, self.photos, self.matching, log_folder, space.progress)
+            match_features(space, self.photos, self.matching)
 
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)

@@ -112,7 +112,7 @@ def reconstruct_in(
         placing = {} if all(rigs.are_known) else {"rigs": mapping}
         plan = {**matching.plan, **placing, "mapping": mapping}
         space = unpublished.begin(plan, with_loops_closed=mapper.close_loops)
-        with space.logged() as log_folder:
+        with space.logged():
 
             def options(rigs: Rigs) -> MappingOptions:
                 return mapping_options(camera, mapper, rigs, seed, space.database)
@@ -122,19 +122,19 @@ def reconstruct_in(
                 space.remove_old_models()
                 forget_loops(space, with_matches=True)
 
-            matching.fill(space, log_folder)
+            matching.fill(space)
             if placing:
                 space.run(
                     "rigs",
                     mapping,
                     lambda: rigs.apply(space.database),
-                    lambda: _place_cameras(space, matching.photos, rigs, options(NO_RIGS), log_folder),
+                    lambda: _place_cameras(space, matching.photos, rigs, options(NO_RIGS)),
                 )
             space.run(
                 "mapping",
                 mapping,
                 begin_mapping,
-                lambda: map_photos(space, matching.photos, options(rigs), log_folder),
+                lambda: map_photos(space, matching.photos, options(rigs)),
             )
     found = read_mapped_models(space.models)
     if len(found) > 1:
@@ -143,7 +143,7 @@ def reconstruct_in(
     return ReconstructionSummary(found, space.seconds, space.earlier_seconds, unpublished.log_path)
 
 
-def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions, log_folder: Path) -> None:
+def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:
     """Map the photos without rigs, and write the rigs' poses found in that model into the database.
 
     Camera poses that the configuration does give set the scale of that model, so that all poses have one unit.
@@ -154,10 +154,11 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
     """
     with scratch_folder(space.folder / "rigs") as folder:
         without_rigs = Workspace(folder, space.progress)
+        without_rigs.log_folder = space.log_folder
         shutil.copyfile(space.database, without_rigs.database)
         with pycolmap.Database.open(without_rigs.database) as database:
             pycolmap.apply_rig_config([], database)
-        map_photos(without_rigs, photos, options, log_folder)
+        map_photos(without_rigs, photos, options)
         model = read_mapped_models(without_rigs.models)[0]
     rigs.rescale(model)
     why_not = (

@@ -44,6 +44,7 @@ class Workspace:
 
     Attributes:
         folder: the folder. database, models, snapshots, log: files and folders in it.
+        log_folder: of the messages of COLMAP in this process and in others, which ``logged`` adds to the log.
         notes: other plain values in the record, by name; see ``note``.
         seconds: duration of each step that was done in this run, by name.
         earlier_seconds: of each step that was taken over, as far as the record has it.
@@ -56,6 +57,7 @@ class Workspace:
         self.models = folder / MODELS_NAME
         self.snapshots = folder / SNAPSHOTS_NAME
         self.log = folder / LOG_NAME
+        self.log_folder = folder
         self._steps, self.notes = (_read(folder / RECORD_NAME, part) for part in ("steps", "notes"))
         self.seconds: dict[str, float] = {}
         self.earlier_seconds: dict[str, float] = {}
@@ -121,14 +123,11 @@ class Workspace:
             shutil.rmtree(folder, ignore_errors=True)
 
     @contextmanager
-    def logged(self) -> Iterator[Path]:
-        """Write COLMAP's messages to the log inside the block, and name the log in the error of a failure.
-
-        Yields the folder of the messages, as ``colmap_log`` does.
-        """
-        with colmap_log(self.log) as log_folder:
+    def logged(self) -> Iterator[None]:
+        """Write COLMAP's messages to the log inside the block, and name the log in the error of a failure."""
+        with colmap_log(self.log) as self.log_folder:
             try:
-                yield log_folder
+                yield
             except ReconstructionError as error:
                 raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
             except RuntimeError as error:
