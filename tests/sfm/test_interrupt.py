@@ -28,7 +28,8 @@ NUM_PHOTOS = 12
 ALL = {"features": NUM_PHOTOS, "matching": NUM_PHOTOS * (NUM_PHOTOS - 1) // 2}
 PROGRAM = """
 import sys
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.reconstruct import reconstruct
 

@@ -7,6 +7,7 @@ and the database is damaged within seconds.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,10 +59,21 @@ def write_position_priors(path: Path, positions: Iterable[tuple[float, float, fl
                 database.write_pose_prior(prior)
 
 
+def files_of_database(path: Path) -> list[Path]:
+    """Return the path of a database, and those of the files that SQLite keeps beside it while a program has it open."""
+    return [path.with_name(path.name + suffix) for suffix in ("", "-wal", "-shm")]
+
+
 def remove_database(path: Path) -> None:
-    """Remove the database file and the files that SQLite keeps beside it."""
-    for suffix in ("", "-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    for file in files_of_database(path):
+        file.unlink(missing_ok=True)
+
+
+def copy_database(source: Path, path: Path) -> None:
+    """Copy a database, with the changes that SQLite has not yet put into its file."""
+    for file, copy in zip(files_of_database(source)[:2], files_of_database(path), strict=False):
+        if file == source or file.is_file():
+            shutil.copyfile(file, copy)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import pycolmap
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.sfm.camera import PhotoCameras
-from rangesfm.sfm.database import copy_features, copying
+from rangesfm.sfm.database import copy_database, copy_features, copying
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS, Photos
 from rangesfm.util.files.atomic import scratch_folder
 from rangesfm.util.files.contents import sha256_of
@@ -89,9 +88,8 @@ def opened(path: Path, photos: Photos, folder: Path) -> Iterator[GivenDatabase]:
             matches nor descriptors.
     """
     with scratch_folder(folder / "given_database") as scratch:
-        copy = Path(shutil.copyfile(path, scratch / "database.db"))
-        if (log := path.with_name(path.name + "-wal")).is_file():  # changes that SQLite has not yet put into the file
-            shutil.copyfile(log, copy.with_name(copy.name + "-wal"))
+        copy = scratch / "database.db"
+        copy_database(path, copy)
         yield _read(path, copy, photos)
 
 

@@ -17,6 +17,7 @@ import pycolmap
 from rangesfm.arrays import Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.progress import Progress
+from rangesfm.sfm.database import copy_database
 from rangesfm.sfm.matching import MatchingOptions, match_pairs
 from rangesfm.sfm.steps import DATABASE_NAME, RECORD_NAME, Workspace
 from rangesfm.util.files.manifest import content_hash
@@ -73,9 +74,7 @@ class LoopMatching(Workspace):
             if not (mark.is_file() and mark.read_text() == made_from and (folder / DATABASE_NAME).is_file()):
                 remove(folder)
                 folder.mkdir()
-                shutil.copyfile(source, folder / DATABASE_NAME)
-                if (log := source.with_name(source.name + "-wal")).is_file():
-                    shutil.copyfile(log, folder / log.name.replace(source.name, DATABASE_NAME))
+                copy_database(source, folder / DATABASE_NAME)
                 if self._has_record:
                     shutil.copyfile(record, folder / RECORD_NAME)
                 mark.write_text(made_from)

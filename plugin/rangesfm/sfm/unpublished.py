@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rangesfm.progress import Progress
+from rangesfm.sfm.database import files_of_database
 from rangesfm.sfm.loop_database import has_closed_loops
 from rangesfm.sfm.steps import DATABASE_NAME, LOG_NAME, RECONSTRUCTION_NAMES, RECORD_NAME, SNAPSHOTS_NAME, Workspace
 from rangesfm.util.files.output_folder import OutputFolder, remove
-
-# Files that SQLite keeps beside a database that a program has open.
-_OF_OPEN_DATABASE = (f"{DATABASE_NAME}-wal", f"{DATABASE_NAME}-shm")
 
 
 class UnpublishedReconstruction:
@@ -67,8 +65,8 @@ class UnpublishedReconstruction:
         self._has_begun = True
         if (self.folder / RECORD_NAME).is_file() and here.num_done(plan) >= num_published:
             return here
-        for name in (*RECONSTRUCTION_NAMES, *_OF_OPEN_DATABASE, SNAPSHOTS_NAME):
-            remove(self.folder / name)
+        for path in (*_places(self.folder), self.folder / SNAPSHOTS_NAME):
+            remove(path)
         # The record is copied last, because without it the other files are not used.
         for name in (DATABASE_NAME, LOG_NAME, RECORD_NAME) if self._has_published else ():
             if (self._output.path / name).is_file():
@@ -110,4 +108,9 @@ class UnpublishedReconstruction:
         remove(self.folder)
 
     def _require_own(self) -> None:
-        self._output.require_own(self._output.path / name for name in (*RECONSTRUCTION_NAMES, *_OF_OPEN_DATABASE))
+        self._output.require_own(_places(self._output.path))
+
+
+def _places(folder: Path) -> list[Path]:
+    """Return what a reconstruction has in a folder, also while a program has its database open."""
+    return [*(folder / name for name in RECONSTRUCTION_NAMES), *files_of_database(folder / DATABASE_NAME)[1:]]
