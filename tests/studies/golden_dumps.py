@@ -252,7 +252,7 @@ def position_equations_of(metric: MetricResult) -> Values:
         "positions residual": problem.linear.residual_m[problem.rows[POSITIONS]],
         "positions derivatives": problem.linear.design[problem.rows[POSITIONS]],
         "positions covariance": problem.noise_of(POSITIONS).covariance_m2,
-        "positions weight": found.fit.weights,
+        "positions weight": found.weights,
     }
 
 

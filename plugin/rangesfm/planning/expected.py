@@ -19,8 +19,8 @@ from rangesfm.estimation.scale.scale_estimate import Verdict, judge
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.tape import CHECK
-from rangesfm.measurements.positions.position_fit import fit_to_map
-from rangesfm.measurements.positions.position_scale import doubts_of_positions, refuse_open_turn
+from rangesfm.measurements.positions.position_scale import doubts_of_positions, fit_positions, refuse_open_turn
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -258,8 +258,9 @@ def _positions(
     if not len(known):
         return None, None, notes
     try:
-        fit = fit_to_map(known, planned.trajectory, tuple(planned.lasting_s), is_at_rest=True)
-        found = fit.at(IDENTITY, max_num)
+        surveyed = SurveyedPositions(lasting_s=tuple(planned.lasting_s))
+        fit = fit_positions(known, planned.trajectory, the_map.bending, surveyed, is_at_rest=True)
+        found = fit.observed(IDENTITY, max_num=max_num)
         alone = the_map.solved([found])[1]
         assert alone.placement is not None, "known positions place the map"
         refuse_open_turn(alone.placement)

@@ -72,7 +72,7 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    fit = scale_by_positions(replace(wrong, is_check=~used), path(), WalkBending(path())).fit
+    fit = scale_by_positions(replace(wrong, is_check=~used), path(), WalkBending(path()))
     assert_same(fit.similarity, SITE_FROM_MODEL)
     np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(fit.stddev_m, 0.1)

@@ -1,4 +1,4 @@
-"""Robust fit of known positions to a map, and these as observations: groups, with the errors of points and receivers.
+"""Known positions as observations of a map: groups, with the errors of points and receivers; and a start of their fit.
 
 A known position p of something with the place c in the model and the lever arm a obeys p = scale * R c + R a + t. Its
 error has several parts: the survey of the point, the marks in the photos, noise of the antenna's positions, and errors
@@ -13,21 +13,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import special
-from scipy.sparse import block_diag, csr_array, diags_array, kron
+from scipy.sparse import block_diag, csr_array, kron
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.errors import GeometryError
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
-from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component, independent_unknowns
+from rangesfm.solver.noise import Component, independent_unknowns
 from rangesfm.solver.posterior import Observations
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, UNDETERMINED
-from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape, similarity_motions
-from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
+from rangesfm.util.geometry.numerics import UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M
+from rangesfm.util.geometry.similarity import Similarity, align_points, path_shape, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
 
 POSITIONS = "positions"
 # Names of errors of an antenna's positions that last for some time start with this, as do all of its positions.
@@ -53,97 +51,6 @@ class GroupedPositions(Observations):
     grouping: csr_array = field(kw_only=True)
 
 
-@dataclass(frozen=True)
-class PositionFit:
-    """A robust fit of known positions to a map.
-
-    Attributes:
-        similarity: from the model of ``path`` to the site.
-        known: the k positions. used: (k,) those that take part. weights, stddev_m: (k,) robust weights, and standard
-            deviations of a coordinate that they assume.
-        lasting_s: for how long errors of an antenna's positions last.
-        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
-        is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
-            similarity is estimated.
-    """
-
-    similarity: Similarity
-    known: KnownPositions
-    path: Trajectory
-    used: Mask
-    weights: Array
-    stddev_m: Array
-    lasting_s: tuple[float, ...]
-    metres_per_unit: float = 1.0
-    is_at_rest: bool = False
-
-    def again(self) -> PositionFit:
-        """Return the fit by iteratively reweighted least squares, starting from this similarity."""
-        known, similarity, used = self.known, self.similarity, self.used
-        for _ in range(MAX_NUM_ROUNDS):
-            off_m = known.misclosures_m(similarity)
-            stddev_m = _stddevs_m(known, off_m, used)
-            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
-            weights = used * CAUCHY.weights(away)
-            if self.is_at_rest:  # the map has its place; only outliers are told apart
-                break
-            root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
-            by = root[:, None] * design_of_positions(known, similarity, self.path)
-            step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
-            similarity = moved_similarity(similarity, step, self.path)
-            if np.abs(step).max() < ROUNDING:
-                break
-        return replace(self, similarity=similarity, weights=weights, stddev_m=stddev_m)
-
-    def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
-        """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
-        known = self.known
-        grouping = _grouped_by_time(known, self.weights, max_num // 3)
-        takes_part = self.used & ((self.weights >= OUTLIER_BELOW) | known.is_mark)
-        used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
-        by_pose = groups_by_pose(known, similarity, self.path, grouping)
-        by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
-        design = grouping @ design_of_positions(known, similarity, self.path)
-        variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
-        weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
-        components = tuple(_components(known, similarity, grouping, self.stddev_m, self.lasting_s))
-        nothing = np.zeros(0, dtype=np.int64)
-        return GroupedPositions(
-            kind=POSITIONS,
-            columns=Columns(0, 1, nothing, nothing, 7),
-            design=design,
-            residual_m=grouping @ known.misclosures_m(similarity).ravel(),
-            by_pose=by_pose,
-            components=_with_frame(components, known, similarity, grouping, design, used),
-            alone_m2=weighed,
-            is_used=used,
-            grouping=grouping,
-        )
-
-
-def fit_to_map(
-    known: KnownPositions,
-    path: Trajectory,
-    lasting_s: tuple[float, ...],
-    *,
-    is_at_rest: bool = False,
-    metres_per_unit: float = 1.0,
-) -> PositionFit:
-    """Fit known positions in the model of a path robustly, with all control points; arguments as of ``PositionFit``.
-
-    Raises:
-        GeometryError: the positions are too few, or on one line.
-    """
-    used, nothing = ~known.is_check, np.zeros(len(known))
-    if not determine(known, used):
-        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
-        raise GeometryError(f"{np.count_nonzero(used)} known positions are in the map, {expected}")
-    # A start that few wrong positions do not move; that of a map at rest.
-    start = IDENTITY if is_at_rest else _of_triples(known, np.flatnonzero(used))
-    begun = PositionFit(start, known, path, used, nothing, nothing, lasting_s, metres_per_unit, is_at_rest=is_at_rest)
-    return begun.again()
-
-
 def determine(known: KnownPositions, used: Mask) -> bool:
     """Return whether positions determine a similarity: three or more that are not on one line."""
     if used.sum() < MIN_NUM_POSITIONS:
@@ -152,7 +59,7 @@ def determine(known: KnownPositions, used: Mask) -> bool:
     return bool(stddevs[1] > UNDETERMINED * stddevs[0])
 
 
-def _stddevs_m(known: KnownPositions, off_m: Array, used: Mask) -> Array:
+def stddevs_as_shown(known: KnownPositions, off_m: Array, used: Mask) -> Array:
     """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
     stddevs, given = np.ones(len(known)), stddev_of(known.covariance_m2)
     freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
@@ -167,7 +74,7 @@ def _stddevs_m(known: KnownPositions, off_m: Array, used: Mask) -> Array:
     return stddevs
 
 
-def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
+def start_of_triples(known: KnownPositions, rows: Indices) -> Similarity:
     """Return the similarity of three positions with the least sum of distances of all: a robust start.
 
     Lever arms are taken off with the rotation of a first fit.
@@ -226,7 +133,7 @@ def stddev_of(covariances: Array) -> Array:
     return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 3))
 
 
-def _grouped_by_time(known: KnownPositions, weights: Array, max_num: int) -> csr_array:
+def grouped_by_time(known: KnownPositions, weights: Array, max_num: int) -> csr_array:
     """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
     marks = np.flatnonzero(known.is_mark)
     others = np.flatnonzero(~known.is_mark & (weights >= OUTLIER_BELOW))
@@ -242,10 +149,10 @@ def _grouped_by_time(known: KnownPositions, weights: Array, max_num: int) -> csr
     return kron(alone, np.eye(3), format="csr")
 
 
-def _components(
+def _alone(
     known: KnownPositions, similarity: Similarity, grouping: csr_array, stddev_m: Array, lasting_s: Sequence[float]
 ) -> Iterator[Component]:
-    """Yield the components of the errors."""
+    """Yield the components of the errors without that of the frame; arguments as for ``components_of``."""
     rotation = similarity.rotation
     places = similarity.scale**2 * rotation @ known.own_covariance @ rotation.T
     places += known.arm_stddev_m[:, None, None] ** 2 * np.eye(3)
@@ -278,23 +185,29 @@ def _components(
         yield Component(_WARP, np.asarray(np.kron(warp, np.eye(3))), _LASTING_SHARE, _SPREAD_GUESSED)
 
 
-def _with_frame(
-    components: Sequence[Component],
+def components_of(
     known: KnownPositions,
     similarity: Similarity,
     grouping: csr_array,
+    stddev_m: Array,
+    lasting_s: Sequence[float],
     design: Array,
     used: Mask,
 ) -> tuple[Component, ...]:
-    """Return the components with the error of the frame of an antenna's positions, in its place and its scale.
+    """Return the components of the errors of groups, with that of the frame of an antenna's positions.
 
-    Positions alone do not show it, as place and scale of the map are no other. A system is taken to shift and to
-    stretch its frame (as a root mean square over the path) by as much as a coordinate errs for some time, or at some
-    place: by what of these errors a similarity does not take up.
+    Positions alone do not show by how much that frame is shifted and stretched, as place and scale of the map are no
+    other. A system is taken to do so (as a root mean square over the path) by as much as a coordinate errs for some
+    time, or at some place: by what of these errors a similarity does not take up.
+
+    Args:
+        grouping: (3 g, 3 k) as of ``GroupedPositions``. stddev_m: (k,) of a coordinate, where none is given.
+        lasting_s: for how long errors of an antenna last. design: (3 g, 7) derivatives. used: (3 g,) that take part.
     """
+    components = tuple(_alone(known, similarity, grouping, stddev_m, lasting_s))
     off_middle = _off_middle(known, similarity, grouping)
     if off_middle is None or not used.any():
-        return tuple(components)
+        return components
     _, has_frame, from_middle, extent_m = off_middle
     is_geodetic = known.is_geodetic[~known.is_mark & np.isfinite(known.time_s)].all()
     stretch = (0.0 if is_geodetic else 1.0) / extent_m * from_middle.ravel()

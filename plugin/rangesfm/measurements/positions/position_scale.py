@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy import special
+from scipy.sparse import diags_array
 
 from rangesfm.arrays import Array, Mask, median, rms
 from rangesfm.errors import GeometryError
@@ -20,24 +21,29 @@ from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_
 from rangesfm.measurements.positions.position_fit import (
     POSITIONS,
     GroupedPositions,
-    PositionFit,
     at_point,
+    components_of,
+    design_of_positions,
     determine,
-    fit_to_map,
+    grouped_by_time,
+    groups_by_pose,
+    start_of_triples,
     stddev_of,
+    stddevs_as_shown,
 )
 from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.options import LEVER_ARM_M
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
-from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
-from rangesfm.util.geometry.similarity import Similarity, align_points
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING
+from rangesfm.util.geometry.robust_statistics import CAUCHY
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
+from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
@@ -71,14 +77,26 @@ class PositionScale(KindOnMap):
     """k known positions on a map, and its scale and place by them alone.
 
     Attributes:
-        fit: robust one of the positions alone, without control points that contradict the others.
-        bending: of the map.
+        known: the positions. path: of the camera, in the model that they are in. bending: of the map.
         surveyed: what the positions were given as.
+        similarity: from that model to the site, as a robust fit of the positions alone has it.
+        is_kept: (k,) those that take part in it: all but check points and control points that contradict the others.
+        weights, stddev_m: (k,) its robust weights, and standard deviations of a coordinate that they assume.
+        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
+        is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
+            similarity is estimated.
     """
 
-    fit: PositionFit
+    known: KnownPositions
+    path: Trajectory
     bending: MapBending
     surveyed: SurveyedPositions
+    similarity: Similarity
+    is_kept: Mask
+    weights: Array
+    stddev_m: Array
+    metres_per_unit: float
+    is_at_rest: bool
 
     kind = POSITIONS
     shows_bending = True
@@ -87,18 +105,35 @@ class PositionScale(KindOnMap):
     @property
     def start(self) -> Similarity:
         """The similarity of the robust fit."""
-        return self.fit.similarity
+        return self.similarity
 
     @cached_property
     def alone(self) -> JointMap:
         """The map by the positions alone, about the similarity of their fit."""
-        fit = self.fit
-        return join_kinds((self,), fit.path, fit.similarity, self.bending, is_at_rest=fit.is_at_rest)
+        return join_kinds((self,), self.path, self.similarity, self.bending, is_at_rest=self.is_at_rest)
+
+    def fitted(self) -> PositionScale:
+        """Return their fit by iteratively reweighted least squares, starting from this similarity."""
+        known, similarity, used = self.known, self.similarity, self.is_kept
+        for _ in range(MAX_NUM_ROUNDS):
+            off_m = known.misclosures_m(similarity)
+            stddev_m = stddevs_as_shown(known, off_m, used)
+            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
+            weights = used * CAUCHY.weights(away)
+            if self.is_at_rest:  # the map has its place; only outliers are told apart
+                break
+            root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
+            by = root[:, None] * design_of_positions(known, similarity, self.path)
+            step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
+            similarity = moved_similarity(similarity, step, self.path)
+            if np.abs(step).max() < ROUNDING:
+                break
+        return replace(self, similarity=similarity, weights=weights, stddev_m=stddev_m)
 
     @property
     def is_left_out(self) -> Mask:
         """(k,) control points that contradict the others."""
-        return np.asarray(~self.known.is_check & ~self.fit.used)
+        return np.asarray(~self.known.is_check & ~self.is_kept)
 
     @property
     def threshold(self) -> float:
@@ -121,7 +156,7 @@ class PositionScale(KindOnMap):
 
     def without_worst(self) -> PositionScale | None:
         """Return them without the control point that contradicts the others most; None if none does."""
-        known, used, found = self.known, self.fit.used, dict[int, PositionScale]()
+        known, used, found = self.known, self.is_kept, dict[int, PositionScale]()
         if not len(rows := np.flatnonzero(used & known.is_mark)):
             return None
 
@@ -129,7 +164,7 @@ class PositionScale(KindOnMap):
             others = used & (np.arange(len(used)) != row)
             if not determine(known, others):
                 return 0.0
-            found[row] = replace(self, fit=replace(self.fit, used=others).again())
+            found[row] = replace(self, is_kept=others).fitted()
             return found[row]._statistic(row)
 
         worst, statistic = most_contradicting(rows, self._statistic, against_others)
@@ -147,19 +182,35 @@ class PositionScale(KindOnMap):
     def observed(
         self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
     ) -> GroupedPositions:
-        """Linearise the positions about a placement."""
+        """Linearise the positions about a placement; an antenna has at most ``max_num`` observations."""
         del in_site
-        return self.fit.at(placed, max_num)
-
-    @property
-    def known(self) -> KnownPositions:
-        """The positions."""
-        return self.fit.known
+        known, similarity = self.known, placed
+        grouping = grouped_by_time(known, self.weights, max_num // 3)
+        takes_part = self.is_kept & ((self.weights >= OUTLIER_BELOW) | known.is_mark)
+        used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
+        by_pose = groups_by_pose(known, similarity, self.path, grouping)
+        by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
+        design = grouping @ design_of_positions(known, similarity, self.path)
+        variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
+        weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
+        lasting_s = self.surveyed.lasting_s
+        nothing = np.zeros(0, dtype=np.int64)
+        return GroupedPositions(
+            kind=POSITIONS,
+            columns=Columns(0, 1, nothing, nothing, 7),
+            design=design,
+            residual_m=grouping @ known.misclosures_m(similarity).ravel(),
+            by_pose=by_pose,
+            components=components_of(known, similarity, grouping, self.stddev_m, lasting_s, design, used),
+            alone_m2=weighed,
+            is_used=used,
+            grouping=grouping,
+        )
 
     def stddevs_m(self, on_map: JointMap) -> Array:
         """Return (k,) standard deviations of a coordinate, without errors that last, as learnt on a map."""
         given, learnt = stddev_of(self.known.covariance_m2), on_map.problem.sizes
-        base = np.where(np.isfinite(given), given, self.fit.stddev_m)
+        base = np.where(np.isfinite(given), given, self.stddev_m)
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
 
     def entry(self, on_map: JointMap) -> Mapping[str, object]:
@@ -229,7 +280,7 @@ class PositionScale(KindOnMap):
     @property
     def used(self) -> Mask:
         """(k,) positions that take part and are no outliers."""
-        return np.asarray(self.takes_part & (self.known.is_mark | (self.fit.weights >= OUTLIER_BELOW)))
+        return np.asarray(self.takes_part & (self.known.is_mark | (self.weights >= OUTLIER_BELOW)))
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that the positions are mirrored, that three of them check nothing, and why the interval is wide."""
@@ -289,19 +340,38 @@ def scale_by_positions(
 ) -> PositionScale:
     """Estimate the similarity to the site by known positions alone, with contradicting control points left out.
 
-    Args:
-        known: positions in the model of ``path``. path: of the camera. bending: of the map.
-        surveyed: what the positions were given as. is_at_rest, metres_per_unit: as of ``PositionFit``.
+    Arguments are as of ``PositionScale``.
 
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    fit = fit_to_map(known, path, surveyed.lasting_s, is_at_rest=is_at_rest, metres_per_unit=metres_per_unit)
-    found = PositionScale(fit, bending, surveyed)
+    found = fit_positions(known, path, bending, surveyed, is_at_rest=is_at_rest, metres_per_unit=metres_per_unit)
     while (without := found.without_worst()) is not None:
         found = without
     refuse_open_turn(found.alone.posterior.place)
     return found
+
+
+def fit_positions(
+    known: KnownPositions,
+    path: Trajectory,
+    bending: MapBending,
+    surveyed: SurveyedPositions,
+    *,
+    is_at_rest: bool = False,
+    metres_per_unit: float = 1.0,
+) -> PositionScale:
+    """Fit known positions to a map robustly, with all control points; arguments and errors as above."""
+    is_kept, nothing = ~known.is_check, np.zeros(len(known))
+    if not determine(known, is_kept):
+        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+        raise GeometryError(f"{np.count_nonzero(is_kept)} known positions are in the map, {expected}")
+    # A start that few wrong positions do not move; that of a map at rest.
+    start = IDENTITY if is_at_rest else start_of_triples(known, np.flatnonzero(is_kept))
+    begun = PositionScale(
+        *(known, path, bending, surveyed, start, is_kept, nothing, nothing), metres_per_unit, is_at_rest
+    )
+    return begun.fitted()
 
 
 def refuse_open_turn(covariance: Array) -> None:
