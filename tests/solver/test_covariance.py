@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import look_at, orbit_path
@@ -29,7 +27,7 @@ from rangesfm.solver import (
     tangent_jacobian,
 )
 from rangesfm.solver.covariance import PhotosAlone, joint_covariance
-from rangesfm.solver.normal_equations import BlockColumns, NormalEquations
+from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.util.geometry.trajectory import pose_of
@@ -202,6 +200,15 @@ def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
         rows = slice(6 * (i - first), 6 * (i - first) + 6)
         assert found.rig_from_world[i] == pytest.approx(turn @ expected[rows, rows] @ turn, rel=1e-5, abs=1e-12)
     start = 6 * (NUM_FRAMES - first)
+    centers = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in survey.poses])
+    by_center = np.linalg.pinv(similarity_motions(centers - centers.mean(axis=0)).reshape(-1, 7))[0].reshape(-1, 3)
+    by_step = np.zeros(len(expected))
+    for k in range(first, NUM_FRAMES):
+        rotation = Rotation.from_quat(survey.poses[k][:4]).as_matrix()
+        x, y, z = 2 * survey.poses[k][4:]
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        by_step[6 * (k - first) : 6 * (k - first) + 6] = by_center[k] @ -rotation.T @ np.hstack([cross, np.eye(3)])
+    assert found.errors.scale_stddev == pytest.approx(np.sqrt(by_step @ expected @ by_step), rel=1e-5)
     if hold_anchors:
         assert np.all(found.anchors == 0)
     else:
@@ -408,9 +415,13 @@ def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hol
     reconstruction, adjuster = photos_alone(hold_first=hold_first)
     frames = np.array(sorted(reconstruction.reg_frame_ids()))
     _, slopes = ratios(reconstruction)
-    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
-    found, shift = of_functions(PhotosAlone(equations, 0.7), frames, np.zeros_like(slopes), slopes)
     poses = [pose_of(reconstruction.frame(i)).params for i in frames.tolist()]
+    # Also of how far two rigs are turned from each other; each turn is in the rig's own frame.
+    turns, axes = np.zeros_like(slopes), np.random.default_rng(3).normal(size=(2, 3))
+    for k, sign in ((1, 1), (5, -1)):
+        turns[:, k] = sign * axes @ Rotation.from_quat(poses[k][:4]).inv().as_matrix()
+    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+    found, shift = of_functions(PhotosAlone(equations, 0.7), frames, turns, slopes)
     blocks = [*poses, *(point.xyz for point in reconstruction.points3D.values())]
     is_free = [adjuster.problem.has_parameter_block(block) for block in blocks]
     covariance = covariance_of_all(adjuster.problem, [b for b, free in zip(blocks, is_free, strict=True) if free])
@@ -423,6 +434,7 @@ def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hol
             by_step = -rotation.T @ np.hstack([cross, np.eye(3)])
             column = 6 * (k - hold_first)
             gradient[column : column + 6] = (slopes[:, k] @ by_step).T
+            gradient[column : column + 3] -= 2 * turns[:, k].T  # by Ceres' step, which is half as long
     np.testing.assert_allclose(found, 0.49 * gradient.T @ covariance @ gradient, rtol=1e-6)
     assert np.abs(shift).max() < 1e-3 * np.sqrt(found.diagonal().min())
 
@@ -451,136 +463,3 @@ def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
     equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
     _, shift = of_functions(PhotosAlone(equations, 1.0), frames, np.zeros_like(slopes), slopes)
     np.testing.assert_allclose(shift, before - after, rtol=0.05)
-
-
-def random_pose(seed: int) -> Array:
-    """Return a random pose as [qx qy qz qw tx ty tz]."""
-    return np.concatenate([Rotation.random(rng=seed).as_quat(), np.random.default_rng(seed).normal(size=3)])
-
-
-def after_step(pose: Array, step: Array) -> tuple[Rotation, Array]:
-    """Return world_from_rig and the centre after a step of Ceres, which turns on the left by twice its step."""
-    rotation = Rotation.from_rotvec(2.0 * step[:3]) * Rotation.from_quat(pose[:4])
-    return rotation.inv(), -rotation.inv().apply(pose[4:] + step[3:])
-
-
-def by_steps(of_step: Callable[[Array], Array]) -> Array:
-    """Return the derivative of a function of a pose's step."""
-    size = 1e-6
-    return np.array([(of_step(size * unit) - of_step(-size * unit)) / (2.0 * size) for unit in np.eye(6)]).T
-
-
-def columns_of(blocks: Sequence[tuple[str, Array, int]], poses: Sequence[Array]) -> BlockColumns:
-    """Return the columns of variable blocks with their numbers of columns; poses may be held."""
-    kinds, arrays, sizes = zip(*blocks, strict=True)
-    return BlockColumns._of_sizes(np.arange(len(poses)) + 1, list(poses), list(arrays), list(kinds), np.array(sizes))
-
-
-def model_of(sensors: Mapping[int, Array | None], cameras: Mapping[int, tuple[Array, float]]) -> Any:
-    """Return what covariances ask of a reconstruction: sensors' poses, and cameras by their focal length."""
-    of_rig = SimpleNamespace(
-        items=lambda: [
-            (SimpleNamespace(id=k), None if pose is None else SimpleNamespace(params=pose))
-            for k, pose in sensors.items()
-        ]
-    )
-    return SimpleNamespace(
-        rigs={1: SimpleNamespace(non_ref_sensors=of_rig)},
-        cameras={
-            k: SimpleNamespace(params=params, mean_focal_length=lambda focal=focal: focal)
-            for k, (params, focal) in cameras.items()
-        },
-    )
-
-
-def definite(size: int, seed: int = 0) -> Array:
-    """Return a random positive definite matrix."""
-    factor = np.random.default_rng(seed).normal(size=(size, 2 * size))
-    matrix: Array = factor @ factor.T
-    return matrix
-
-
-@dataclass(frozen=True)
-class Small:
-    """Normal equations of three poses, of which the second is held, with an anchor and a bias."""
-
-    poses: list[Array]
-    anchor: Array
-    bias: Array
-    equations: NormalEquations
-
-    @property
-    def normal(self) -> Array:
-        others = self.equations.others.toarray()
-        normal: Array = csr_array(self.equations.of_photos).toarray() + others.T @ others
-        return normal
-
-    @property
-    def by_center(self) -> list[Array]:
-        """Derivatives of the centres by all columns."""
-        slopes = [np.zeros((3, 16)) for _ in self.poses]
-        for k, columns in ((0, slice(6)), (2, slice(6, 12))):
-            slopes[k][:, columns] = by_steps(lambda step, k=k: after_step(self.poses[k], step)[1])  # type: ignore[misc]
-        return slopes
-
-
-def small() -> Small:
-    poses, anchor, bias = [random_pose(k) for k in range(3)], np.zeros(3), np.zeros(1)
-    blocks = [("pose", poses[0], 6), ("pose", poses[2], 6), ("anchor", anchor, 3), ("other", bias, 1)]
-    of_photos = np.zeros((16, 16))
-    of_photos[:12, :12] = definite(12)
-    rng = np.random.default_rng(1)
-    equations = NormalEquations(
-        reconstruction=model_of({}, {}),
-        columns=columns_of(blocks, poses),
-        of_photos=csr_array(of_photos),
-        gradient=np.concatenate([rng.normal(size=12), np.zeros(4)]),
-        others=csr_array(rng.normal(size=(9, 16))),
-        free=np.zeros((16, 0)),
-        free_of_photos=np.zeros((16, 0)),
-        size_m=2.0,
-    )
-    return Small(poses, anchor, bias, equations)
-
-
-@pytest.mark.parametrize("residual_stddev", [1.0, 0.5])
-def test_each_part_of_the_covariance_is_that_of_the_inverse(residual_stddev: float) -> None:
-    given = small()
-    errors = joint_covariance(given.equations, anchors={"0": given.anchor}, residual_stddev=residual_stddev)
-    found = Found(errors, given.poses, 0)
-    expected = residual_stddev**2 * np.linalg.inv(given.normal)
-    turn = np.diag([2.0, 2, 2, 1, 1, 1])
-    of_poses = [turn @ expected[:6, :6] @ turn, np.zeros((6, 6)), turn @ expected[6:12, 6:12] @ turn]
-    np.testing.assert_allclose(found.rig_from_world, of_poses, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.centers, [s @ expected @ s.T for s in given.by_center], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(found.anchors, expected[None, 12:15, 12:15], rtol=1e-9)
-    centers = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in given.poses])
-    motions = similarity_motions(centers - centers.mean(axis=0)).reshape(9, 7)
-    fit = np.linalg.pinv(motions) @ np.vstack(given.by_center)
-    assert errors.scale_stddev == pytest.approx(np.sqrt(fit[0] @ expected @ fit[0]))
-    assert {kind: part.ids for kind, part in errors.parts.items()} == {"frame": (1, 2, 3), "anchor": ("0",)}
-    modes, of_anchor = errors.parts["frame"].modes[:, 3:], errors.parts["anchor"].modes[0]
-    for slopes, of_center in zip(given.by_center, modes, strict=True):
-        np.testing.assert_allclose(of_center @ of_center.T, slopes @ expected @ slopes.T, rtol=1e-5, atol=1e-8)
-        np.testing.assert_allclose(of_center @ of_anchor.T, slopes @ expected[:, 12:15], rtol=1e-5, atol=1e-8)
-    by_scale = expected[12:15] @ fit[0] / errors.scale_stddev**2
-    np.testing.assert_allclose(errors.parts["anchor"].by_scale, by_scale[None], rtol=1e-6, atol=1e-8)
-
-
-def test_functions_of_poses_err_as_the_photos_inverse_says() -> None:
-    given, rng = small(), np.random.default_rng(3)
-    of_photos = csr_array(given.equations.of_photos).toarray()[:12, :12]
-    by_turn, by_center = rng.normal(size=(2, 2, 3, 3))
-    found, shift = of_functions(PhotosAlone(given.equations, 0.5), np.array([3, 1, 2]), by_turn, by_center)
-    slopes = np.zeros((2, 12))
-    for k, (pose, columns) in enumerate(((2, slice(6, 12)), (0, slice(6)))):
-        before = Rotation.from_quat(given.poses[pose][:4])
-
-        def moved(step: Array, pose: int = pose, before: Rotation = before) -> Array:
-            world_from_rig, center = after_step(given.poses[pose], step)
-            return np.concatenate([(before * world_from_rig).as_rotvec(), center])
-
-        slopes[:, columns] = np.hstack([by_turn[:, k], by_center[:, k]]) @ by_steps(moved)
-    inverse = np.linalg.inv(of_photos)
-    np.testing.assert_allclose(found, 0.25 * slopes @ inverse @ slopes.T, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(shift, -slopes @ inverse @ given.equations.gradient[:12], rtol=1e-6, atol=1e-9)
