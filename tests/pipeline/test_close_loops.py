@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.known import known
+from tests.listener import Listener
 from tests.outputs import names_in
 from tests.simulated.looped import around_a_room, bent_laps, two_laps, write_matches, write_survey
 from tests.simulated.surveys import TAG_IN_CAM_M
@@ -29,19 +30,6 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.manifest import content_hash
 from rangesfm.util.geometry.similarity import rmse
-
-
-class Listener(Progress):
-    def __init__(self) -> None:
-        self.stages: list[str] = []
-        self.counts: list[tuple[int, int]] = []
-
-    def stage(self, name: str) -> None:
-        self.stages.append(name)
-
-    def update(self, num_done: int, num_total: int = 0) -> None:
-        if self.stages[-1:] == ["loops"]:
-            self.counts.append((num_done, num_total))
 
 
 @dataclass(frozen=True)
@@ -110,7 +98,7 @@ def closed(laps: Laps) -> ClosedLaps:
         patch.setattr("rangesfm.pipeline.run.write_results", write)
         summary = refine_model(laps.survey, progress=listener).summary
     assert content_hash(laps.database) == before
-    return ClosedLaps(summary, written[0], listener.counts)
+    return ClosedLaps(summary, written[0], listener.updates["loops"])
 
 
 def num_pairs(path: Path) -> int:

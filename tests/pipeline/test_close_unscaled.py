@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pycolmap
 import pytest
+from tests.listener import Listener
 from tests.outputs import names_in
 from tests.simulated.looped import LoopedSurvey, Matches, Pair, around_a_room, two_aisles, write_matches
 
@@ -23,23 +24,6 @@ from rangesfm.survey.settings import Survey
 from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.similarity import IDENTITY, align_points, rmse
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
-
-
-class Listener(Progress):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.stages: list[str] = []
-        self.counts: list[tuple[int, int]] = []
-
-    def message(self, text: str) -> None:
-        self.lines.append(text)
-
-    def stage(self, name: str) -> None:
-        self.stages.append(name)
-
-    def update(self, num_done: int, num_total: int = 0) -> None:
-        if self.stages[-1:] == ["loops"]:
-            self.counts.append((num_done, num_total))
 
 
 @dataclass(frozen=True)
@@ -86,9 +70,9 @@ def test_a_model_without_any_measurement_has_its_loops_closed_though_it_was_inte
             made.close()
     assert (tmp_path / "out" / "sparse" / "0" / "points3D.bin").read_bytes() == before
     closed = made.close(listener)
-    num_done, num_all = listener.counts[0]
+    num_done, num_all = listener.updates["loops"][0]
     assert num_done == num_all > 0  # it has the matches of the interrupted run
-    (line,) = (line for line in listener.lines if line.startswith("loops: "))
+    (line,) = (line for line in listener.messages if line.startswith("loops: "))
     assert "were used to close loops" in line
     assert made.error_m(closed) < 0.4 * open_m
     assert made.error_m(made.model) == pytest.approx(made.error_m(closed), rel=1e-9)
@@ -130,7 +114,7 @@ def test_aisles_that_look_alike_are_not_taken_for_one(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(LoopMatching, "match", match_all)
     assert made.error_m(made.close(listener)) < 1.5 * open_m
-    assert any(f"; {len(survey.alike)} contradict the model and were not used" in line for line in listener.lines)
+    assert any(f"; {len(survey.alike)} contradict the model and were not used" in line for line in listener.messages)
 
 
 def test_loops_stay_open_where_more_than_neighbours_was_matched(tmp_path: Path) -> None:

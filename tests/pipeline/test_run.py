@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.known import known
+from tests.listener import Listener
 from tests.outputs import names_in, paths_below
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
@@ -38,18 +39,6 @@ from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
-
-
-class Listener(Progress):
-    def __init__(self) -> None:
-        self.stages: list[str] = []
-        self.messages: list[str] = []
-
-    def stage(self, name: str) -> None:
-        self.stages.append(name)
-
-    def message(self, text: str) -> None:
-        self.messages.append(text)
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from PIL import Image
+from tests.listener import Listener
 
 from rangesfm.options import CameraOptions
-from rangesfm.progress import Progress
 
 WIDTH, HEIGHT, FOCAL_LENGTH = 256, 192, 240.0
 
@@ -25,24 +25,6 @@ class Room:
     names: tuple[str, ...]
     centers: npt.NDArray[np.float64]
     camera: CameraOptions
-
-
-class Listener(Progress):
-    """A Progress that records what it is told."""
-
-    def __init__(self) -> None:
-        self.stages: list[str] = []
-        self.updates: dict[str, list[tuple[int, int]]] = {}
-        self.messages: list[str] = []
-
-    def stage(self, name: str) -> None:
-        self.stages.append(name)
-
-    def update(self, num_done: int, num_total: int = 0) -> None:
-        self.updates.setdefault(self.stages[-1], []).append((num_done, num_total))
-
-    def message(self, text: str) -> None:
-        self.messages.append(text)
 
 
 @pytest.fixture

@@ -18,7 +18,8 @@ from rangesfm.sfm.photo_files import Photos, usable_photos
 from rangesfm.sfm.reconstruct import reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 GIVEN = CameraOptions(model="PINHOLE", params=(240.0, 240.0, 128.0, 96.0))
 _MODEL, _ORIENTATION = 0x0110, 0x0112

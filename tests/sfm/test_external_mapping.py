@@ -23,7 +23,8 @@ from rangesfm.progress import SILENT, Progress
 from rangesfm.sfm.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=2)
 PROGRAM = """

@@ -21,7 +21,8 @@ from rangesfm.sfm.reconstruct import ReconstructionSummary, reconstruct
 from rangesfm.util.files.contents import sha256_of
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 FEATURES = {"sift": {"first_octave": 0, "max_num_features": 250}}
 

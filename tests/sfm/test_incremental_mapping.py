@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.few_links import leave_few_links
+from tests.simulated.looped import matches_in, write_matches
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
-from tests.studies.simulated_database import write_database
+from tests.simulated.pieces import leave_across
 
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
@@ -29,13 +29,12 @@ def walk(num_photos: int, max_track_length: int) -> pycolmap.Reconstruction:
     path = loop_path(20.0, num_turns=0.4, seed=1)
     centers, world_from_cam = path.centers(times), path.world_from_cam(times)
     return synthetic_model(
-        times, centers, world_from_cam, num_observations=150, max_track_length=max_track_length
+        times, centers, world_from_cam, num_observations=150, max_track_length=max_track_length, pixel_stddev=0.3
     ).reconstruction
 
 
-def write_matches(path: Path, model: pycolmap.Reconstruction) -> Path:
-    num = sum(len(image.points2D) for image in model.images.values())
-    write_database(path, model, 0.3 * np.random.default_rng(0).standard_normal((num, 2)))
+def matched(path: Path, model: pycolmap.Reconstruction) -> Path:
+    write_matches(path, model, matches_in(model))
     return path
 
 
@@ -43,8 +42,8 @@ def write_matches(path: Path, model: pycolmap.Reconstruction) -> Path:
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Matches of half a walk around a yard, with a gap that no match bridges."""
     model = walk(16, max_track_length=6)
-    leave_few_links(model, 10, num_links=0)
-    return write_matches(tmp_path_factory.mktemp("database") / "database.db", model)
+    leave_across(model, {image.name for image_id, image in model.images.items() if image_id > 10}, 0)
+    return matched(tmp_path_factory.mktemp("database") / "database.db", model)
 
 
 def options_of(num_threads: int, *, reproducible: bool) -> pycolmap.IncrementalPipelineOptions:
@@ -92,7 +91,7 @@ def test_it_gives_colmaps_models(database: Path, options: pycolmap.IncrementalPi
 
 def test_threads_do_not_change_a_reproducible_map(tmp_path: Path) -> None:
     """With several threads, the mapping begins with one of seven pairs of photos."""
-    database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
+    database = matched(tmp_path / "database.db", walk(28, max_track_length=7))
     (expected,) = mapped(database, options_of(1, reproducible=False))
     assert expected.num_reg_images() == 28
     for _ in range(4):
@@ -102,7 +101,7 @@ def test_threads_do_not_change_a_reproducible_map(tmp_path: Path) -> None:
 
 def test_threads_give_a_map_as_good(tmp_path: Path) -> None:
     true = walk(28, max_track_length=7)
-    database = write_matches(tmp_path / "database.db", true)
+    database = matched(tmp_path / "database.db", true)
     options = options_of(8, reproducible=False)
     assert options.num_threads == 8
     (found,), (alone,) = mapped(database, options), mapped(database, options_of(1, reproducible=False))
@@ -113,7 +112,7 @@ def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
     tmp_path: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> None:
     true = walk(16, max_track_length=6)
-    database = write_matches(tmp_path / "database.db", true)
+    database = matched(tmp_path / "database.db", true)
     with pycolmap.Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
         focal_length_px, camera.params = camera.params[0], [*(1.03 * camera.params[:2]), *camera.params[2:]]
@@ -192,7 +191,7 @@ def test_a_mapping_goes_on_after_any_photo_of_any_model(
 def test_a_mapping_that_goes_on_adjusts_the_whole_when_it_would_have(
     tmp_path: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> None:
-    database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
+    database = matched(tmp_path / "database.db", walk(28, max_track_length=7))
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
     moments, whole = moments_of(database, options)
     # In smaller models, the adjustment of a photo's neighbourhood changes all photos, too.

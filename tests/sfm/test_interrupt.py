@@ -21,7 +21,8 @@ from rangesfm.sfm.database import num_photos_with_features
 from rangesfm.sfm.reconstruct import reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}})
 NUM_PHOTOS = 12

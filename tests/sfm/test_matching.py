@@ -23,7 +23,8 @@ from rangesfm.sfm.photo_files import Photos, usable_photos
 from rangesfm.sfm.steps import Workspace
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 NUM_PHOTOS, NUM_PAIRS = 9, 36
 

@@ -24,7 +24,8 @@ from rangesfm.sfm import pairs
 from rangesfm.sfm.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 FEATURES = {"sift": {"first_octave": 0, "max_num_features": 250}}  # enough for these photos, and quick
 MAPPER = MapperOptions(features=FEATURES, reproducible=True)

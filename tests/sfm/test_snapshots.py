@@ -20,7 +20,8 @@ from rangesfm.sfm.incremental_mapping import UnfinishedMapping, size_of, snapsho
 from rangesfm.sfm.reconstruct import reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 # With several threads, COLMAP would start from whichever pair is ready first.
 MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, reproducible=True)

@@ -19,7 +19,8 @@ from rangesfm.mapper_options import MapperOptions
 from rangesfm.sfm.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:
-    from tests.sfm.conftest import Listener, Room
+    from tests.listener import Listener
+    from tests.sfm.conftest import Room
 
 MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=2)
 

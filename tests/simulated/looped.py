@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.estimation.with_ranges import refine_with_ranges
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
@@ -84,14 +85,8 @@ class LoopedSurvey:
 
     @cached_property
     def matches(self) -> dict[Pair, Matches]:
-        """Features (m, 2) of the same points in two photos, for all pairs that have enough of them."""
-        found: dict[Pair, list[Pair]] = {}
-        for _, point in sorted(self.truth.points3D.items()):
-            seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
-            for k, (first, place) in enumerate(seen):
-                for second, other in seen[k + 1 :]:
-                    found.setdefault((first, second), []).append((place, other))
-        return {pair: np.array(of) for pair, of in found.items() if len(of) >= MIN_NUM_SHARED}
+        """Matches of all pairs that have enough of them."""
+        return {pair: of for pair, of in matches_in(self.truth).items() if len(of) >= MIN_NUM_SHARED}
 
     @property
     def neighbours(self) -> dict[Pair, Matches]:
@@ -114,6 +109,16 @@ def _pieces(seen: list[Pair], max_length: int) -> Iterable[list[Pair]]:
         for start in range(begin, end, max_length):
             if len(piece := seen[start : min(start + max_length, end)]) > 1:
                 yield piece
+
+
+def matches_in(model: pycolmap.Reconstruction) -> dict[Pair, Matches]:
+    """Return features (m, 2) of the same points in two photos, by the photos' ids."""
+    found: dict[Pair, list[Pair]] = {}
+    for _, point in sorted(model.points3D.items()):
+        seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
+        for (first, place), (second, other) in combinations(seen, 2):
+            found.setdefault((first, second), []).append((place, other))
+    return {pair: np.array(of) for pair, of in found.items()}
 
 
 def write_matches(
@@ -217,6 +222,23 @@ class ScaledMap:
         """Refine the scaled map, or another map in metres."""
         model = self.scaled if start is None else start
         return refine(self.problem(model, self.ranges, is_refined=start is not None))
+
+    def refined_by_default(self) -> pycolmap.Reconstruction:
+        """Refine the scaled map with the errors of ranges that the scale stage found."""
+        estimate = self.estimate
+        refined, _ = refine_with_ranges(
+            self.scaled,
+            self.trajectory,
+            estimate.observations,
+            estimate.metric_from_sfm,
+            estimate.anchors,
+            estimate.errors,
+            tag_in_cam_m=TAG_IN_CAM_M,
+            first_pose_is_fixed=self.survey.is_in_first_camera,
+            camera=CameraOptions(refine_intrinsics=False),
+            num_threads=1,
+        )
+        return refined
 
     def error_m(self, model: pycolmap.Reconstruction) -> float:
         """Return the root mean square error of the keyframes, without alignment."""

@@ -90,13 +90,9 @@ MODEL = ("out/sparse/0/cameras.bin", "out/sparse/0/images.bin", "out/sparse/0/po
 RECORDS = ("out/.rangesfm/manifest.json", "out/.rangesfm")
 RESULT = (
     *("out/result.json", "out/ranges.csv", "out/images.csv", "out/pose_covariance.csv", "out/scale_consensus.csv"),
-    *(
-        "out/scale_candidates.csv",
-        "out/reference.csv",
-        "out/sparse_metric/0/images.bin",
-        "out/sparse_metric/0/points3D.bin",
-    ),
-    *("out/sparse_metric/0/cameras.bin", "out/sparse_scaled/0/images.bin", "out/sparse_scaled/0/frames.bin", *RECORDS),
+    *("out/scale_candidates.csv", "out/reference.csv", "out/sparse_metric/0/images.bin"),
+    *("out/sparse_metric/0/points3D.bin", "out/sparse_metric/0/cameras.bin", "out/sparse_scaled/0/images.bin"),
+    *("out/sparse_scaled/0/frames.bin", *RECORDS),
 )
 PHOTOS = ("images", "images/IMG_0001.jpg", "images/IMG_0002.jpg", "images/IMG_0009.jpg")
 SURVEY = ("survey.toml", "uwb.csv", "anchors.csv", "reference.csv", *PHOTOS)

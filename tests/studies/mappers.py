@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 from tests.peak_memory import peak_bytes
+from tests.simulated.looped import matches_in, write_matches
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
-from tests.studies.simulated_database import write_database
 
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.mapper_options import MapperOptions
@@ -76,8 +76,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
         seed=seed,
     )
     model = made.reconstruction
-    num_features = sum(len(image.points2D) for image in model.images.values())
-    write_database(folder / "database.db", model, np.zeros((num_features, 2)))
+    write_matches(folder / "database.db", model, matches_in(model))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     # Global mapping begins with the relative poses.

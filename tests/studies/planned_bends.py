@@ -30,10 +30,9 @@ from tests.simulated.surveys import (
 )
 from tests.studies.kept_runs import Row, spread, study
 
-from rangesfm.estimation.with_ranges import refine_with_ranges
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.errors.components import COMPONENTS
-from rangesfm.options import CameraOptions, RangeModelOptions
+from rangesfm.options import RangeModelOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
@@ -111,20 +110,11 @@ def one_run(survey: Truth, pixel_stddev: float, seed: int) -> Row:
     """Return the root mean square errors of the keyframes: refined, and before that after the best similarity."""
     sfm = mapped(survey, pixel_stddev, seed)
     made = ScaledMap.of(survey, sfm, range_log(survey, seed, biases_m=drawn_biases(survey, seed)))
-    truth, free, estimate = survey.model.centers_m, made.trajectory.centers, made.estimate
-    refined, _ = refine_with_ranges(
-        made.scaled,
-        made.trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        estimate.errors,
-        tag_in_cam_m=TAG_IN_CAM_M,
-        first_pose_is_fixed=survey.is_in_first_camera,
-        camera=CameraOptions(refine_intrinsics=False),
-        num_threads=1,
-    )
-    return {"refined": made.error_m(refined), "bend": rmse(align_points(free, truth).apply(free) - truth)}
+    truth, free = survey.model.centers_m, made.trajectory.centers
+    return {
+        "refined": made.error_m(made.refined_by_default()),
+        "bend": rmse(align_points(free, truth).apply(free) - truth),
+    }
 
 
 def rms(stddevs: Expected) -> float:

@@ -24,28 +24,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
-from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.looped import ScaledMap
 from tests.simulated.path import loop_path
-from tests.simulated.ranges import simulate_ranges_at
+from tests.simulated.surveys import RANGE_STDDEV_M, SITE_ANCHORS_M, TAG_IN_CAM_M, Truth, mapped, range_log, truth_of
 
-from rangesfm.colmap.transform import rescale
-from rangesfm.demo.simulated_radio import Radio
-from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.with_ranges import refine_with_ranges
-from rangesfm.measurements.ranges.anchors.anchor import Anchor
-from rangesfm.measurements.ranges.association import associate
-from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.util.geometry.similarity import Similarity, align_points
+from rangesfm.options import RangeModelOptions
+from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 
 PIXEL_STDDEV = 0.5
-RANGE_STDDEV_M = 0.1
-FOCAL_PX = 750.0
+FOCAL_PX = 750.0  # of the simulated camera
 RANGE_MODEL = RangeModelOptions()
-TAG_IN_CAM_M = np.array([0.05, -0.12, -0.03])
 
 MAX_MEAN_STANDARD_ERRORS = 2.5
 MAX_SPREAD_OVER_BOUND = 1.2
@@ -58,7 +49,7 @@ class Case:
     """A kind of survey.
 
     Attributes:
-        anchors_m: true positions by id, in the world of the simulation.
+        anchors_m: true positions by id, in the site.
         anchor_frame: as in ``initialize_scale``.
         num_epochs: ranges to each anchor at each keyframe.
     """
@@ -68,15 +59,16 @@ class Case:
     anchor_frame: str
     num_epochs: int
 
+    def truth(self) -> Truth:
+        """Return a walk around a yard, without noise."""
+        path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
+        times = np.linspace(0.0, 40.0, 30)
+        return truth_of(path, times, self.anchors_m, self.anchor_frame, 80, max_track_length=None)
+
 
 CASES = (
-    Case(
-        "four site anchors",
-        {"A1": (9.0, 7.0, 3.0), "A2": (-9.0, 6.0, 0.5), "A3": (-8.0, -8.0, 3.5), "A4": (9.0, -7.0, 0.2)},
-        "site",
-        2,
-    ),
-    Case("one anchor known in the first camera frame", {"A1": (9.0, 7.0, 3.0)}, "first_camera", 4),
+    Case("four site anchors", SITE_ANCHORS_M, "site", 2),
+    Case("one anchor known in the first camera frame", {"A1": SITE_ANCHORS_M["A1"]}, "first_camera", 4),
     Case("one unknown anchor", {"A1": (6.0, 6.0, 3.0)}, "unknown", 20),
 )
 
@@ -105,65 +97,19 @@ class CaseResult:
         )
 
 
-def exact_model() -> SyntheticModel:
-    """A walk around a yard, without noise."""
-    path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
-    times = np.linspace(0.0, 40.0, 30)
-    return synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=80, focal_px=FOCAL_PX, seed=1
-    )
-
-
 def study_case(case: Case, num_seeds: int) -> CaseResult:
-    model = exact_model()
-    errors = [scale_error(case, model, seed) for seed in range(num_seeds)]
-    return CaseResult(case, np.array(errors), scale_bound(case, model))
+    truth = case.truth()
+    errors = [scale_error(case, truth, seed) for seed in range(num_seeds)]
+    return CaseResult(case, np.array(errors), scale_bound(case, truth))
 
 
-def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
+def scale_error(case: Case, truth: Truth, seed: int) -> float:
     """Return the refined scale of one survey over the true one, minus 1."""
-    sfm = mapped_model(model, seed)
-    trajectory = trajectory_from_reconstruction(sfm, model.timestamps_s)
-    keyframe = range_keyframes(case, model)
     biases = np.random.default_rng([seed, 2]).multivariate_normal(np.zeros(len(case.anchors_m)), bias_covariance(case))
-    log = simulate_ranges_at(
-        np.array(list(model.timestamps_s.values()))[keyframe],
-        model.centers_m[keyframe],
-        model.world_from_cam[keyframe],
-        case.anchors_m,
-        TAG_IN_CAM_M,
-        Radio(range_stddev_m=RANGE_STDDEV_M, range_bias_m=dict(zip(case.anchors_m, biases.tolist(), strict=True))),
-        seed,
-    )
-    frame_from_world = Similarity(1.0, np.eye(3), np.zeros(3))
-    if case.anchor_frame != "site":
-        frame_from_world = Similarity(1.0, model.world_from_cam[0], model.centers_m[0]).inverse()
-    estimate = initialize_scale(
-        associate(log, trajectory, TAG_IN_CAM_M),
-        trajectory,
-        [Anchor(name, frame_from_world.apply(np.array(position))) for name, position in case.anchors_m.items()],
-        anchor_frame=case.anchor_frame,
-        range_model=RANGE_MODEL,
-    )
-    refined, _ = refine_with_ranges(
-        rescale(sfm, estimate.metric_from_sfm),
-        trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        estimate.errors,
-        tag_in_cam_m=TAG_IN_CAM_M,
-        first_pose_is_fixed=estimate.frame != "site",
-        camera=CameraOptions(refine_intrinsics=False),
-        num_threads=1,
-    )
-    centers = trajectory_from_reconstruction(refined, model.timestamps_s).centers
-    return align_points(frame_from_world.apply(model.centers_m), centers).scale - 1
-
-
-def range_keyframes(case: Case, model: SyntheticModel) -> npt.NDArray[np.int64]:
-    """Return the keyframe of each round of ranges."""
-    return np.repeat(np.arange(len(model.centers_m)), case.num_epochs)
+    log = range_log(truth, seed, biases_m=biases, num_each=case.num_epochs)
+    refined = ScaledMap.of(truth, mapped(truth, PIXEL_STDDEV, seed), log).refined_by_default()
+    centers = trajectory_from_reconstruction(refined, truth.model.timestamps_s).centers
+    return align_points(truth.model.centers_m, centers).scale - 1
 
 
 def bias_covariance(case: Case) -> Array:
@@ -173,37 +119,19 @@ def bias_covariance(case: Case) -> Array:
     return covariance
 
 
-def mapped_model(model: SyntheticModel, seed: int) -> pycolmap.Reconstruction:
-    """Return the model with noisy keypoints, adjusted by COLMAP."""
-    rng = np.random.default_rng([seed, 1])
-    sfm = pycolmap.Reconstruction(model.reconstruction)
-    config = pycolmap.BundleAdjustmentConfig()
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for image_id in sfm.reg_image_ids():
-        config.add_image(image_id)
-        points = sfm.image(image_id).points2D
-        for point, noise in zip(points, PIXEL_STDDEV * rng.standard_normal((len(points), 2)), strict=True):
-            point.xy = point.xy + noise
-    options = pycolmap.BundleAdjustmentOptions(
-        print_summary=False, refine_focal_length=False, refine_extra_params=False
-    )
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, sfm).solve()
-    return sfm
-
-
-def scale_bound(case: Case, model: SyntheticModel) -> float:
+def scale_bound(case: Case, truth: Truth) -> float:
     """Return the Cramer-Rao bound on the stddev of the scale error.
 
     Each pose has six columns, for a step of its centre c and a rotation w: c + dc, R Exp(dw), R = world_from_cam. Then
     comes one column for each bias and, where anchors are estimated, three for each anchor. The first camera's pose is
     not estimated in its own frame.
     """
-    centers, num_poses, num_anchors = model.centers_m, len(model.centers_m), len(case.anchors_m)
+    centers, num_anchors = truth.model.centers_m, len(case.anchors_m)
+    num_poses = len(centers)
     num_columns = 6 * num_poses + num_anchors + (3 * num_anchors if case.anchor_frame == "unknown" else 0)
     information = np.zeros((num_columns, num_columns))
-    add_reprojections(information, model)
-    add_ranges(information, model, case)
+    add_reprojections(information, truth)
+    add_ranges(information, truth, case)
     # The alignment's scale grows by sum (c - mean).dc / sum |c - mean|^2, whatever its rotation and translation.
     from_middle = centers - centers.mean(axis=0)
     gradient = np.zeros(len(information))
@@ -212,18 +140,17 @@ def scale_bound(case: Case, model: SyntheticModel) -> float:
     return float(np.sqrt(gradient[first:] @ np.linalg.solve(information[first:, first:], gradient[first:])))
 
 
-def add_reprojections(information: Array, model: SyntheticModel) -> None:
+def add_reprojections(information: Array, truth: Truth) -> None:
     """Add the information on the poses, with each point eliminated (its Schur complement)."""
-    world_from_sfm = model.metric_from_sfm
+    model = truth.model
     for point in model.reconstruction.points3D.values():
-        in_world = world_from_sfm.apply(point.xyz)
         # Image ids are frame numbers, counted from 1; no track of the simulation comes back to an image.
         frames = [element.image_id - 1 for element in point.track.elements]
         to_pose = np.zeros((2 * len(frames), 6 * len(frames)))
         to_point = np.zeros((2 * len(frames), 3))
         for k, frame in enumerate(frames):
             cam_from_world = model.world_from_cam[frame].T
-            x, y, z = in_cam = cam_from_world @ (in_world - model.centers_m[frame])
+            x, y, z = in_cam = cam_from_world @ (point.xyz - model.centers_m[frame])
             projection = FOCAL_PX / z * np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / PIXEL_STDDEV
             to_pose[2 * k : 2 * k + 2, 6 * k : 6 * k + 3] = -projection @ cam_from_world
             to_pose[2 * k : 2 * k + 2, 6 * k + 3 : 6 * k + 6] = projection @ cross_matrix(in_cam)
@@ -234,15 +161,15 @@ def add_reprojections(information: Array, model: SyntheticModel) -> None:
         information[np.ix_(columns, columns)] += schur
 
 
-def add_ranges(information: Array, model: SyntheticModel, case: Case) -> None:
+def add_ranges(information: Array, truth: Truth, case: Case) -> None:
     """Add the information on poses, biases and anchors, with the biases' prior."""
-    first_bias = 6 * len(model.centers_m)
+    model, first_bias = truth.model, 6 * len(truth.model.centers_m)
     first_anchor = first_bias + len(case.anchors_m)
-    for frame in range_keyframes(case, model):
+    for frame in np.repeat(np.arange(len(model.centers_m)), case.num_epochs):
         world_from_cam = model.world_from_cam[frame]
         tag = model.centers_m[frame] + world_from_cam @ TAG_IN_CAM_M
-        for k, position in enumerate(case.anchors_m.values()):
-            direction = (tag - np.array(position)) / np.linalg.norm(tag - np.array(position))
+        for k, position in enumerate(truth.anchors_m.values()):
+            direction = (tag - position) / np.linalg.norm(tag - position)
             row = np.zeros(len(information))
             row[6 * frame : 6 * frame + 3] = direction
             row[6 * frame + 3 : 6 * frame + 6] = -direction @ world_from_cam @ cross_matrix(TAG_IN_CAM_M)
