@@ -12,7 +12,7 @@ from distributed import KilledWorker
 from rangesfm.batch.batch_page import render_batch
 from rangesfm.batch.batch_state import STATUSES, BatchState, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job
-from rangesfm.batch.workers import MAX_STOP_S, Crew, KilledError, on_scheduler, on_this_machine
+from rangesfm.batch.workers import MAX_STOP_S, Crew, on_scheduler, on_this_machine
 from rangesfm.errors import FAILED, Failure
 from rangesfm.solver.installation_checks import recorded_versions
 from rangesfm.util.files.atomic import sole_writer, write_text
@@ -122,6 +122,4 @@ def _ending(future: Any) -> Any:
         return future.result(timeout=MAX_STOP_S)
     if isinstance(error, KilledWorker):
         return Failure("its worker was lost, and so were the workers that tried it again", FAILED)
-    if isinstance(error, KilledError):
-        return Failure(f"{error}; this happened at every attempt", FAILED)
     return Failure(" ".join(f"its worker failed: {type(error).__name__}: {error}".split()), FAILED)

@@ -34,7 +34,7 @@ from rangesfm.util.processes.supervision import call_by_name, supervise
 
 MAX_STOP_S = 30.0  # longer than it takes to interrupt a survey
 _CONNECT_S = 10
-_NUM_RETRIES = 2  # of a survey whose process was killed; Dask itself counts attempts whose worker was killed
+_NUM_ATTEMPTS = 3  # to run a survey whose process is killed; Dask itself counts attempts whose worker was killed
 # Signals by which the system, when memory is short, or a user kills a process. Such a survey is tried again.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 # Batches whose surveys this Dask worker must not run any more.
@@ -46,7 +46,7 @@ class Crew:
     """Those who run the surveys of a batch.
 
     Attributes:
-        submit: has the survey with this index run, and returns a future with what ``run_apart`` returns or raises.
+        submit: has the survey with this index run, and returns a future with what ``run_apart`` returns.
         stop: interrupts all surveys, and waits for their end, so that nothing is left half-written.
         is_lost: whether no more surveys can end, because nobody answers.
     """
@@ -74,26 +74,20 @@ def on_this_machine(
         say(note)
     stop = threading.Event()
 
-    def run(index: int, survey: Survey) -> Any:
-        def tell(message: dict[str, Any]) -> None:
-            inbox.put((index, message))
-
-        for num_retries_left in reversed(range(_NUM_RETRIES + 1)):
-            try:
-                return run_apart(survey, options.restart, num_threads, memory_bytes, tell, stop.is_set)
-            except KilledError:
-                if not num_retries_left:
-                    raise
-        return None
-
     with ThreadPoolExecutor(num_at_once, thread_name_prefix="survey") as pool:
+
+        def submit(index: int, survey: Survey) -> Any:
+            def tell(message: dict[str, Any]) -> None:
+                inbox.put((index, message))
+
+            return pool.submit(run_apart, survey, options.restart, num_threads, memory_bytes, tell, stop.is_set)
 
         def stop_all() -> None:
             stop.set()
             pool.shutdown(cancel_futures=True)
 
         try:
-            yield Crew(lambda index, survey: pool.submit(run, index, survey), stop_all, lambda: False)
+            yield Crew(submit, stop_all, lambda: False)
         finally:
             stop.set()
 
@@ -115,7 +109,7 @@ def on_scheduler(options: BatchOptions, inbox: queue.SimpleQueue[Any], say: Call
         def submit(index: int, survey: Survey) -> Any:
             task = batch, index, survey, options, at_once
             key = f"{batch}-{index}"
-            futures.append(client.submit(_run_on_worker, *task, key=key, pure=False, retries=_NUM_RETRIES))
+            futures.append(client.submit(_run_on_worker, *task, key=key, pure=False))
             return futures[-1]
 
         def stop() -> None:
@@ -216,10 +210,6 @@ def _stop_on_worker(batch: str) -> None:
     _stopped.add(batch)
 
 
-class KilledError(Exception):
-    """The survey's process was killed from outside; the text is one line for the user."""
-
-
 def run_apart(
     survey: Survey,
     restart: bool,
@@ -228,39 +218,37 @@ def run_apart(
     tell: Callable[[dict[str, Any]], object],
     is_stopped: Callable[[], bool],
 ) -> Any:
-    """Run a survey in a process of its own.
+    """Run a survey in a process of its own, and again if that is killed from outside, because it may succeed then.
 
     Returns:
         A Failure, or the result of the process: ``{"figures": ..., "reason": ...}``.
-
-    Raises:
-        KilledError: the process was killed from outside, so that another attempt may succeed.
     """
-    if is_stopped():
-        return Failure("interrupted", INTERRUPTED)
-    tell({"began_on": socket.gethostname()})
     own = survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
     survey = survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
-    ended = supervise(
-        # By its name, because what runs a batch loads no estimator.
-        partial(call_by_name, "rangesfm.batch.survey_process:run_in_batch", survey, restart),
-        tell,
-        environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
-        memory_limit_bytes=memory_limit_bytes,
-        is_stopped=is_stopped,
-    )
-    if "done" in ended.last:
-        return ended.last["done"]
-    if "failed" in ended.last:
-        return Failure(**ended.last["failed"])
-    if ended.needed_bytes:
-        needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
-        why = f"needs more memory than its share: it took {needed}, and its limit is {limit}"
-        return Failure(f"{why}; set a larger --memory_limit or fewer --num_workers", FAILED)
-    if ended.stopped:
-        return Failure("interrupted", INTERRUPTED)
-    if ended.signal in _FROM_OUTSIDE:
-        raise KilledError(
-            f"its process was killed ({ended.signal.name}) by a user, or by the system because memory was short"
+    killed = ""
+    for _ in range(_NUM_ATTEMPTS):
+        if is_stopped():
+            return Failure("interrupted", INTERRUPTED)
+        tell({"began_on": socket.gethostname()})
+        ended = supervise(
+            # By its name, because what runs a batch loads no estimator.
+            partial(call_by_name, "rangesfm.batch.survey_process:run_in_batch", survey, restart),
+            tell,
+            environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
+            memory_limit_bytes=memory_limit_bytes,
+            is_stopped=is_stopped,
         )
-    return Failure(ended.how, FAILED)
+        if "done" in ended.last:
+            return ended.last["done"]
+        if "failed" in ended.last:
+            return Failure(**ended.last["failed"])
+        if ended.needed_bytes:
+            needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
+            why = f"needs more memory than its share: it took {needed}, and its limit is {limit}"
+            return Failure(f"{why}; set a larger --memory_limit or fewer --num_workers", FAILED)
+        if ended.stopped:
+            return Failure("interrupted", INTERRUPTED)
+        if ended.signal not in _FROM_OUTSIDE:
+            return Failure(ended.how, FAILED)
+        killed = f"its process was killed ({ended.signal.name}) by a user, or by the system because memory was short"
+    return Failure(f"{killed}; this happened at every attempt", FAILED)
