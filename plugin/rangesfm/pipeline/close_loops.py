@@ -6,7 +6,6 @@ its photos alone.
 
 from __future__ import annotations
 
-import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -134,11 +133,11 @@ def close_loops_of_models(
         if not tried.closed:
             matching.publish_with(output)
             return models[0]
-        places, staged = output.path / MODELS_NAME, matching.folder / MODELS_NAME
-        shutil.copytree(places, staged, dirs_exist_ok=True, ignore=lambda *_: ["0"])
-        (staged / "0").mkdir(exist_ok=True)
-        write_binary_model(last.model, staged / "0")
-        matching.publish_with(output, {places: staged}, [output.path / name for name in RESULT_NAMES])
+        staged = matching.folder / "model"
+        staged.mkdir(exist_ok=True)
+        write_binary_model(last.model, staged)
+        place = output.path / MODELS_NAME / "0"
+        matching.publish_with(output, {place: staged}, [output.path / name for name in RESULT_NAMES])
         return last.model
 
 

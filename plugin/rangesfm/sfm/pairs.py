@@ -25,13 +25,6 @@ PairingOptions = (
     | pycolmap.VocabTreePairingOptions
 )
 NamedPairs = tuple[tuple[str, str], ...]
-# COLMAP's options of each way of pairing, and its generator of the pairs.
-_WAYS: dict[str, tuple[type[PairingOptions], Callable[..., Any]]] = {
-    "exhaustive": (pycolmap.ExhaustivePairingOptions, pycolmap.ExhaustivePairGenerator),
-    "sequential": (pycolmap.SequentialPairingOptions, pycolmap.SequentialPairGenerator),
-    "spatial": (pycolmap.SpatialPairingOptions, pycolmap.SpatialPairGenerator),
-    "vocabtree": (pycolmap.VocabTreePairingOptions, pycolmap.VocabTreePairGenerator),
-}
 
 
 def pairing_options(mapper: MapperOptions, num_photos: int) -> PairingOptions | NamedPairs:
@@ -45,7 +38,13 @@ def pairing_options(mapper: MapperOptions, num_photos: int) -> PairingOptions | 
     way = mapper.matching
     if way == "auto":
         way = "exhaustive" if num_photos <= _MAX_NUM_EXHAUSTIVE else "sequential"
-    options = _WAYS[way][0]()
+    ways: dict[str, PairingOptions] = {
+        "exhaustive": pycolmap.ExhaustivePairingOptions(),
+        "sequential": pycolmap.SequentialPairingOptions(),
+        "spatial": pycolmap.SpatialPairingOptions(),
+        "vocabtree": pycolmap.VocabTreePairingOptions(),
+    }
+    options = ways[way]
     if mapper.vocab_tree_path is not None and way in ("sequential", "vocabtree"):
         options.vocab_tree_path = mapper.vocab_tree_path  # type: ignore[union-attr]
     apply_options(options, mapper.pairing, "mapper.pairing")
@@ -80,13 +79,18 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: PairingOptions 
     """
     if isinstance(pairing, tuple):
         return _pairs_of_names(photos.names, pairing)
-    generator_of = dict(_WAYS.values())
+    generators: dict[type[PairingOptions], Callable[..., Any]] = {
+        pycolmap.ExhaustivePairingOptions: pycolmap.ExhaustivePairGenerator,
+        pycolmap.SequentialPairingOptions: pycolmap.SequentialPairGenerator,
+        pycolmap.SpatialPairingOptions: pycolmap.SpatialPairGenerator,
+        pycolmap.VocabTreePairingOptions: pycolmap.VocabTreePairGenerator,
+    }
     # COLMAP's sequential matching takes the order of names for the order in time.
     is_sequential = isinstance(pairing, pycolmap.SequentialPairingOptions)
     naming = named_by_place(database_path, photos.names) if is_sequential else nullcontext()
     with naming, pycolmap.Database.open(database_path) as database:
         try:
-            pairs = generator_of[type(pairing)](pairing, database).all_pairs()
+            pairs = generators[type(pairing)](pairing, database).all_pairs()
         except (RuntimeError, ValueError) as error:
             if not isinstance(pairing, pycolmap.VocabTreePairingOptions):
                 raise
