@@ -20,7 +20,6 @@ from tests.sfm.matches import content_of
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
-from rangesfm.sfm import pairs
 from rangesfm.sfm.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:
@@ -237,7 +236,7 @@ class TestEarlierRun:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patched:
-            patched.setitem(pairs._WAYS, "sequential", (pycolmap.SequentialPairingOptions, die))
+            patched.setattr(pycolmap, "SequentialPairGenerator", die)
             mapper = MapperOptions(features=FEATURES, matching="sequential")
             with pytest.raises(KeyboardInterrupt):
                 reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)

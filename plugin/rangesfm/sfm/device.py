@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import pycolmap
 
+from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError
 from rangesfm.installed_versions import OTHER_BUILDS, num_gpus
 from rangesfm.mapper_options import MapperOptions
@@ -25,28 +29,24 @@ def uses_gpu(mapper: MapperOptions) -> bool:
     return bool(num)
 
 
-def refuse_missing_gpu(use_gpu: bool, table: str) -> None:
-    """Refuse COLMAP's own key ``use_gpu`` where there is no GPU.
+def apply_options_of_device(
+    options: pycolmap.FeatureExtractionOptions | pycolmap.FeatureMatchingOptions, values: Mapping[str, Any], table: str
+) -> None:
+    """Set attributes of COLMAP's options for features or matches as ``apply_options``.
 
     Raises:
-        OptionError: the key is true, and pycolmap, built with CUDA, finds no GPU.
+        OptionError: as there; or ``type`` is a learned method, which the installed pycolmap cannot run, or ``use_gpu``
+            is true, and pycolmap, built with CUDA, finds no GPU.
     """
-    if use_gpu and num_gpus() == 0:
+    apply_options(options, values, table)
+    name = options.type.name
+    is_learned = not name.startswith("SIFT") or name.endswith("LIGHTGLUE")
+    if is_learned and "aliked" not in pycolmap.FeatureExtractionOptions().todict():
+        raise OptionError(
+            f"[{table}] type is '{name}', expected SIFT: the installed pycolmap {pycolmap.__version__} is built without"
+            " ONNX, which runs networks; use database_path for features of other programs",
+            table,
+            "type",
+        )
+    if options.use_gpu and num_gpus() == 0:
         raise OptionError(f"[{table}] use_gpu is true, expected false: pycolmap finds no GPU", table, "use_gpu")
-
-
-def refuse_learned(name: str, table: str) -> None:
-    """Refuse learned features and learned matching where pycolmap is built without them.
-
-    Raises:
-        OptionError: ``name``, the key ``type`` of the table, is a learned method and pycolmap cannot run it.
-    """
-    if not name.startswith("SIFT") or name.endswith("LIGHTGLUE"):
-        known = pycolmap.FeatureExtractionOptions().todict()
-        if "aliked" not in known:
-            raise OptionError(
-                f"[{table}] type is '{name}', expected SIFT: the installed pycolmap {pycolmap.__version__} is built"
-                " without ONNX, which runs networks; use database_path for features of other programs",
-                table,
-                "type",
-            )

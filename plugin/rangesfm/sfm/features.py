@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.sfm.background import find_features
 from rangesfm.sfm.database import num_photos_with_features
-from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
+from rangesfm.sfm.device import apply_options_of_device, uses_gpu
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS, Photos
 from rangesfm.sfm.steps import Workspace
 from rangesfm.util.processes.supervision import run_child
@@ -29,9 +28,7 @@ def feature_options(mapper: MapperOptions) -> pycolmap.FeatureExtractionOptions:
         InputError: a key or value that COLMAP does not have, or no GPU where one is asked for.
     """
     options = pycolmap.FeatureExtractionOptions(num_threads=mapper.num_threads, use_gpu=uses_gpu(mapper))
-    apply_options(options, mapper.features, "mapper.features")
-    refuse_learned(options.type.name, "mapper.features")
-    refuse_missing_gpu(options.use_gpu, "mapper.features")
+    apply_options_of_device(options, mapper.features, "mapper.features")
     return options
 
 

@@ -13,13 +13,12 @@ from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import Progress
 from rangesfm.sfm.background import match_share, run_in_background
 from rangesfm.sfm.database import copy_matches, copy_photos, num_matching_pairs, remove_database
-from rangesfm.sfm.device import refuse_learned, refuse_missing_gpu, uses_gpu
+from rangesfm.sfm.device import apply_options_of_device, uses_gpu
 from rangesfm.sfm.pairs import NamedPairs, PairingOptions, pairing_options, pairs_to_match
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.steps import Workspace
@@ -94,9 +93,7 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
     )
     # Set in COLMAP's own options, because their RANSAC defaults differ from those of a fresh RANSACOptions.
     options.verification.ransac.random_seed = seed
-    apply_options(options.matcher, mapper.matcher, "mapper.matcher")
-    refuse_learned(options.matcher.type.name, "mapper.matcher")
-    refuse_missing_gpu(options.matcher.use_gpu, "mapper.matcher")
+    apply_options_of_device(options.matcher, mapper.matcher, "mapper.matcher")
     return options
 
 
