@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tests.simulated.path import loop_path
 
 from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = (0.05, -0.12, -0.03)
 TRUE_SCALE = 0.45
 RANGE_STDDEV_M = 0.1
-# Biases are known to be zero, so that the bound is that of the scale alone.
+# Biases are known to be zero.
 RANGE_MODEL = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
 OPTIONS = ScaleOptions(max_relative_stddev=1.0)
 
@@ -43,11 +43,10 @@ def in_first_camera(path: CameraPath, time: float, position: Array) -> Array:
     return np.asarray(rotation.T @ (position - origin))
 
 
-def scale_error(observations: RangeObservations, trajectory: Trajectory, anchors: list[Anchor]) -> float:
-    estimate = initialize_scale(
+def scale_of(observations: RangeObservations, trajectory: Trajectory, anchors: list[Anchor]) -> ScaleEstimate:
+    return initialize_scale(
         observations, trajectory, anchors, anchor_frame="first_camera", options=OPTIONS, range_model=RANGE_MODEL, seed=0
     )
-    return estimate.value / TRUE_SCALE - 1
 
 
 def test_interpolated_ranges_give_a_far_better_scale_than_those_at_photos_alone() -> None:
@@ -62,8 +61,8 @@ def test_interpolated_ranges_give_a_far_better_scale_than_those_at_photos_alone(
         assert log.timestamp_s is not None
         is_far = np.abs(log.timestamp_s - np.rint(log.timestamp_s)) > 0.02
         near = replace(found, status=np.where(is_far, RangeStatus.CHECK, found.status).astype(np.int8))
-        errors_of_all.append(scale_error(found, trajectory, anchors))
-        errors_of_near.append(scale_error(near, trajectory, anchors))
+        errors_of_all.append(scale_of(found, trajectory, anchors).value / TRUE_SCALE - 1)
+        errors_of_near.append(scale_of(near, trajectory, anchors).value / TRUE_SCALE - 1)
     # Ten times as many ranges make the scale up to 3.2 times as accurate.
     assert np.sqrt(np.mean(np.square(errors_of_all))) < 0.6 * np.sqrt(np.mean(np.square(errors_of_near)))
 
@@ -78,30 +77,31 @@ def stop_and_go_log(stops: Array, rotations: Array, anchor_m: Array, num_at_each
     return RangeLog.from_arrays(["A"] * len(stop), ranges, timestamp_s=times)
 
 
-# With 200, there are more ranges than errors are learnt from.
-@pytest.mark.parametrize("num_at_each", [6, 200])
-def test_ranges_at_a_still_camera_all_count(num_at_each: int) -> None:
+def test_ranges_at_a_still_camera_all_count() -> None:
     rng = np.random.default_rng(0)
     angle = np.linspace(0.0, 5.0, 25)
     stops = np.stack([5 * np.cos(angle), 5 * np.sin(angle), 0.3 * np.sin(2 * angle)], axis=1)
     rotations = Rotation.from_rotvec(rng.normal(0, 0.4, (25, 3))).as_matrix()
     rotations, stops = rotations[0].T @ rotations, (stops - stops[0]) @ rotations[0]
-    anchor_m = np.array([9.0, 6.0, 3.0])
+    anchor_m, num_seeds = np.array([9.0, 6.0, 3.0]), 30
     names = tuple(f"{number:02d}.jpg" for number in range(25))
     trajectory = Trajectory(np.arange(25), names, np.linspace(0.0, 240.0, 25), stops / TRUE_SCALE, rotations)
-    to_tags = stops + rotations @ np.array(TAG_IN_CAM_M) - anchor_m
-    # The derivative of a range by the logarithm of the scale is the part of the centre that points at the anchor.
-    gradient = np.sum(to_tags * stops, axis=1) / np.linalg.norm(to_tags, axis=1)
-    bound = RANGE_STDDEV_M / np.sqrt(num_at_each * np.sum(gradient**2))
-    num_seeds, errors = 30, []
-    for seed in range(num_seeds):
-        log = stop_and_go_log(stops, rotations, anchor_m, num_at_each, seed)
-        found = associate(log, trajectory, TAG_IN_CAM_M)
-        assert np.all(found.status == RangeStatus.USED)
-        np.testing.assert_array_equal(found.before, np.repeat(np.arange(25), num_at_each))
-        np.testing.assert_array_equal(found.before, found.after)
-        errors.append(scale_error(found, trajectory, [Anchor("A", anchor_m)]))
-    # The spread may exceed the bound by 1.1 and by chance, at one in a thousand; a Cauchy loss alone takes 1.03.
-    most = 1.1 * np.sqrt(chi2.ppf(0.999, num_seeds) / num_seeds)
-    least = np.sqrt(chi2.ppf(0.001, num_seeds) / num_seeds)
-    assert least < np.sqrt(np.mean(np.square(errors))) / bound < most
+    least, most = np.sqrt(chi2.ppf([0.001, 0.999], num_seeds) / num_seeds)
+    spreads = []
+    for num_at_each in (6, 200):  # with 200, there are more ranges than errors are learnt from
+        errors, stated = [], []
+        for seed in range(num_seeds):
+            log = stop_and_go_log(stops, rotations, anchor_m, num_at_each, seed)
+            found = associate(log, trajectory, TAG_IN_CAM_M)
+            assert np.all(found.status == RangeStatus.USED)
+            np.testing.assert_array_equal(found.before, np.repeat(np.arange(25), num_at_each))
+            np.testing.assert_array_equal(found.before, found.after)
+            estimate = scale_of(found, trajectory, [Anchor("A", anchor_m)])
+            errors.append(estimate.value / TRUE_SCALE - 1)
+            stated.append(estimate.uncertainty.components["white"])
+        spreads.append(np.sqrt(np.mean(np.square(errors))))
+        assert least < spreads[-1] / np.median(stated) < most
+    # Noise is all that these ranges have, but not all that is expected of a radio. Errors that last, as by distance,
+    # are so much larger than the noise of 5000 ranges that the weights are chosen for these: the spread is not 5.8, but
+    # at least 4 times smaller.
+    assert spreads[1] < spreads[0] / 4
