@@ -14,7 +14,6 @@ from tests.simulated.model import SyntheticModel
 
 from rangesfm.measurements.kind import LEAST_SQUARES, MapState
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.anchors.point_fit import PointProblem
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.range_bins import by_poses
 from rangesfm.measurements.ranges.radio import ranges_of_map
@@ -131,13 +130,6 @@ def test_all_models_predict_the_same_ranges(scene: Scene) -> None:
     np.testing.assert_allclose(predicted_ranges(problem, scene.state) - problem.range_m, expected, atol=1e-9)
     in_map = scene.ranges.linearize(scene.in_map).residual[:, 0]
     np.testing.assert_allclose(in_map, expected[scene.ranges.rows], atol=1e-9)
-    tags_m = np.empty_like(scene.tags_m)
-    tags_m[scene.ranges.rows] = scene.tags_m
-    for k in range(3):
-        rows, ones = scene.log.anchor_index == k, np.ones(np.sum(scene.log.anchor_index == k))
-        alone = PointProblem(tags_m[rows], scene.log.range_m[rows], ones, 0 * ones, np.zeros(4), np.eye(4))
-        unknowns = np.append(scene.anchors_m[k], scene.biases_m[k])
-        np.testing.assert_allclose(alone.residuals_m(unknowns), expected[rows], atol=1e-9)
 
 
 def test_all_models_change_alike_with_the_keyframes(scene: Scene) -> None:

@@ -1,8 +1,6 @@
-"""Robust least squares for the position of a point and a range bias, without a first guess, with their uncertainty.
+"""Robust fit of an anchor to ranges at known positions of the tag, without a first guess, and the ranges' errors.
 
-    predicted = || p - a || + b
-
-p: known position of the tag; a: unknown position of the point, an anchor's antenna; b: range bias.
+It is the problem of ``scale/range_equation.py`` for one anchor and a path that is given.
 """
 
 from __future__ import annotations
@@ -12,19 +10,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
 from rangesfm.measurements.ranges.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise
 from rangesfm.measurements.ranges.errors.range_bins import noisiness, range_bins
-from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
-from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss, robust_stddevs
-from rangesfm.util.geometry.similarity import path_shape
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    columns_of,
+    predicted_ranges,
+    prior_jacobian,
+    range_jacobian,
+    solve,
+)
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.util.geometry.robust_statistics import SAME_COST, robust_stddevs
+from rangesfm.util.geometry.similarity import IDENTITY, path_shape
 
-# Rounds of reweighting in the linear solution.
-_NUM_ROUNDS = 12
 # Added to the diagonal of normal equations, whose columns have length 1 before weighting. It keeps them regular where
 # outliers have lost all their weight.
 _RIDGE = 1e-16
@@ -38,11 +42,13 @@ _NUM_DIRECTIONS = 20
 _WIDTHS = np.geomspace(30.0, 0.3, 5)
 # Number of ranges that the usual noise counts as.
 _USUAL_NOISE_COUNTS = 2.0
+# Standard deviation of a coordinate that is known, as a height, metres.
+_KNOWN_STDDEV_M = 0.01
 # Error components that are not learnt here, because each anchor's bias is estimated with a prior of its own.
 _NOT_HERE = ("bias", "common_bias")
 
 
-def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
+def multilaterate(positions: Array, ranges: Array, num_rounds: int = 12) -> tuple[Array, Array]:
     """Locate a point by its distances to known positions, by a robust linear method that needs no start.
 
     rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane, the height above it
@@ -51,6 +57,7 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
     Args:
         positions: (..., n, 3) known positions, metres, for one point or for many at once.
         ranges: (n,) or (..., n) distances, metres.
+        num_rounds: of reweighting.
 
     Returns:
         The point (..., 3), and the residuals (..., n) of the linear model, metres.
@@ -67,7 +74,7 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
     rest = (nothing + _RIDGE)[..., None] * np.eye(4)
     weights = 1 / np.maximum(2 * ranges, 1e-3)
     robust = np.ones_like(squared)
-    for _ in range(_NUM_ROUNDS):
+    for _ in range(num_rounds):
         weighted = (design * (weights**2 * robust)[..., None]).swapaxes(-1, -2)
         solution = np.linalg.solve(weighted @ design + rest, weighted @ squared[..., None])
         residuals = weights * ((design @ solution)[..., 0] - squared)
@@ -80,69 +87,29 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class PointProblem:
-    """n ranges to one point with the unknowns x = (a, b), four numbers.
-
-    The point must be near the origin, because large coordinates lose digits.
-
-    Attributes:
-        positions_m: (n, 3) positions of the tag.
-        range_m: (n,) measured ranges.
-        stddev_m: (n,) their standard deviations.
-        shared_stddev_m: (n,) part of the standard deviation that ranges of about the same length share.
-        prior_mean: (4,) prior mean of x.
-        prior: (k, 4) square root of the prior information: ``prior @ (x - prior_mean)`` is standard normal.
-    """
-
-    positions_m: Array
-    range_m: Array
-    stddev_m: Array
-    shared_stddev_m: Array
-    prior_mean: Array
-    prior: Array
-
-    def subset(self, rows: Indices) -> PointProblem:
-        """Return the problem with some of its ranges."""
-        names = ("positions_m", "range_m", "stddev_m", "shared_stddev_m")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
-
-    def residuals_m(self, x: Array) -> Array:
-        """Return predicted minus measured ranges (n,), metres."""
-        residuals: Array = self._gradient(x).distance_m + x[3] - self.range_m
-        return residuals
-
-    def slopes(self, x: Array) -> Array:
-        """Return the derivatives (n, 4) of the residuals in metres."""
-        by_anchor = self._gradient(x).by_anchor
-        return np.column_stack([by_anchor, np.ones(len(by_anchor))])
-
-    def jacobian(self, x: Array) -> Array:
-        """Return the derivatives (n, 4) of the residuals in standard deviations."""
-        jacobian: Array = self.slopes(x) / self.stddev_m[:, None]
-        return jacobian
-
-    def _gradient(self, x: Array) -> RangeGradient:
-        return RangeGradient.of(self.positions_m - x[:3])
-
-    def cost(self, x: Array, loss: RobustLoss = CAUCHY) -> float:
-        """Return half the robust sum of squares, including the prior."""
-        rho = loss.rho((self.residuals_m(x) / self.stddev_m) ** 2)[0]
-        return float(np.sum(rho) + np.sum((self.prior @ (x - self.prior_mean)) ** 2)) / 2
-
-
-@dataclass(frozen=True)
 class PointFit:
-    """Estimate of a point, with the noise that was estimated with it.
+    """Estimate of an anchor by its n ranges, with the noise that was estimated with it.
 
     Attributes:
-        problem: the problem with the final standard deviations.
-        x: (4,) position and bias.
+        problem: of the anchor alone, on a path that is given, with the final standard deviations. Coordinates in
+            ``anchor_mean_m`` are known, and NaN are not. All are near the origin, because large ones lose digits.
+        fit: its solution.
         own_stddev_m: (n,) noise of each range, without the part that ranges share.
     """
 
-    problem: PointProblem
-    x: Array
+    problem: RangeProblem
+    fit: RangeFit
     own_stddev_m: Array
+
+    @property
+    def at_m(self) -> Array:
+        """Position (3,) of the anchor."""
+        return np.asarray(self.fit.state.anchors_m[0])
+
+    @property
+    def bias_m(self) -> float:
+        """Bias of the ranges."""
+        return float(self.fit.state.bias_m[0])
 
     @property
     def noise_m(self) -> float:
@@ -150,42 +117,66 @@ class PointFit:
         return float(np.median(self.own_stddev_m))
 
     @property
-    def residuals_m(self) -> Array:
-        return self.problem.residuals_m(self.x)
-
-    @property
     def off_m(self) -> Array:
         """Measured minus predicted ranges (n,), with the prior mean of the bias, metres."""
-        return -self.problem.residuals_m(np.append(self.x[:3], self.problem.prior_mean[3]))
+        return np.asarray(self.bias_m - self.problem.bias_mean_m[0] - self.fit.residuals_m)
 
     @property
-    def weights(self) -> Array:
-        """Weights of the robust loss (n,)."""
-        return CAUCHY.weights(self.residuals_m / self.problem.stddev_m)
+    def slopes(self) -> Array:
+        """(n, q) derivatives of the ranges by the position and, unless it is known, the bias."""
+        in_metres, state = replace(self.problem, stddev_m=np.ones(len(self.own_stddev_m))), self.fit.state
+        return range_jacobian(in_metres, self.fit.columns[0], state, state)[:, 1:]
+
+    def prior(self, factor: float = 1.0) -> Array:
+        """Return the (r, q) derivatives of the priors by the same, in standard deviations.
+
+        Args:
+            factor: by which the prior of the bias was strengthened, as the known coordinates are then, too.
+        """
+        of_bias = prior_jacobian(self.problem, self.fit.columns[0], self.fit.state, self.fit.state)
+        _, *known = known_directions(self.problem)
+        return np.vstack([of_bias, *(factor / _KNOWN_STDDEV_M * each for each in known)])[:, 1:]
+
+    def near(self, place_m: Array) -> PointFit:
+        """Return the best fit near another place (3,)."""
+        start = replace(self.fit.state, anchors_m=place_m[None])
+        return replace(self, fit=solve(self.problem, start, held=known_directions(self.problem)))
 
 
-def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
-    """Fit a point and estimate the noise from its residuals, until both agree; given noise is a lower bound.
+def known_directions(problem: RangeProblem) -> list[Array]:
+    """Return what is held in the problem of an anchor: the scale of the path, and the coordinates that are known.
+
+    They are directions (p,) in the parameters of the problem.
+    """
+    columns = columns_of([problem])[0]
+    known = columns.anchor[0] + np.flatnonzero(~np.isnan(problem.anchor_mean_m))
+    return [*np.eye(columns.num)[[columns.scale, *known]]]
+
+
+def fit_with_own_noise(problem: RangeProblem, shared_m: Array, given_m: Array) -> PointFit:
+    """Fit an anchor and estimate the noise from its residuals, until both agree; given noise is a lower bound.
 
     Args:
-        problem: the problem; of its standard deviations only the shared ones are used.
+        problem: as in ``PointFit``; its standard deviations are not used.
+        shared_m: (n,) standard deviation of the error that ranges of about the same length share.
         given_m: (n,) noise of each range, NaN where it is unknown.
     """
     is_given = np.isfinite(given_m)
     unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else START_STDDEV_M)
-    x, noise = _best_start(problem, unit)
+    state, noise = _best_start(problem, shared_m, unit)
     least = 1.0 if is_given.all() else 0.0
     noise = max(noise, least)
     for _ in range(MAX_NUM_ROUNDS):
-        now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m))
-        fit = PointFit(now, improve(now, x), noise * unit)
-        x = fit.x
-        ordinary = problem.shared_stddev_m < noise * unit
+        now = replace(problem, stddev_m=np.hypot(noise * unit, shared_m))
+        found = PointFit(now, solve(now, state, held=known_directions(now)), noise * unit)
+        state = found.fit.state
+        ordinary = shared_m < noise * unit
         rows = ordinary if np.mean(ordinary) > MIN_ORDINARY else np.ones(len(unit), dtype=np.bool_)
-        before, noise = noise, max(_noise_of(fit.residuals_m[rows] / unit[rows], len(x)), least)
+        num_unknowns = found.slopes.shape[1]
+        before, noise = noise, max(_noise_of(found.fit.residuals_m[rows] / unit[rows], num_unknowns), least)
         if abs(noise - before) <= SAME_COST * before:
             break
-    return fit
+    return found
 
 
 def _noise_of(scaled: Array, num_unknowns: int) -> float:
@@ -198,26 +189,8 @@ def _noise_of(scaled: Array, num_unknowns: int) -> float:
     return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
 
 
-def improve(problem: PointProblem, x: Array, tolerance: float = ROUNDING) -> Array:
-    """Return the minimum (4,) of the cost near ``x``, with a Cauchy loss on the ranges and none on the prior."""
-    num = len(problem.range_m)
-
-    def loss(squared: Array) -> Array:
-        prior = squared[num:]
-        return np.hstack([CAUCHY.rho(squared[:num]), [prior, np.ones(len(prior)), np.zeros(len(prior))]])
-
-    found = least_squares(
-        lambda x: np.append(problem.residuals_m(x) / problem.stddev_m, problem.prior @ (x - problem.prior_mean)),
-        x,
-        lambda x: np.vstack([problem.jacobian(x), problem.prior]),
-        loss=loss,
-        **dict.fromkeys(("ftol", "xtol", "gtol"), tolerance),
-    )
-    return np.asarray(found.x)
-
-
-def _best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
-    """Return the most likely unknowns (4,) in spite of outliers, and the noise there as a multiple of ``unit_m``.
+def _best_start(problem: RangeProblem, shared_m: Array, unit_m: Array) -> tuple[RangeState, float]:
+    """Return the most likely state in spite of outliers, and the noise there as a multiple of ``unit_m``.
 
     Starting points all around the tag, and the linear solution, follow the minima of a Cauchy loss while it narrows
     from metres to centimetres. Of all minima on the way, the most likely one is chosen.
@@ -226,36 +199,40 @@ def _best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
         unit_m: (n,) noise of the ranges relative to each other.
     """
     rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), ENOUGH_TO_SEARCH)).astype(np.int64)
-    part, unit_m = problem.subset(rows), unit_m[rows]
-    now, passed = _starts(part), []
+    part, unit_m, shared_m = problem.subset(rows), unit_m[rows], shared_m[rows]
+    now, passed, held = _starts(part), list[RangeState](), known_directions(part)
     for width in _WIDTHS:
-        narrowed = replace(part, stddev_m=np.hypot(width * unit_m, part.shared_stddev_m))
-        now = _distinct([improve(narrowed, x, SAME_COST) for x in now], float(unit_m.min()))
+        narrowed = replace(part, stddev_m=np.hypot(width * unit_m, shared_m))
+        fits = [solve(narrowed, state, held=held, tolerance=SAME_COST) for state in now]
+        now = _distinct([fit.state for fit in fits], float(unit_m.min()))
         passed += now
-    noises = [inlier_noise(part.residuals_m(x) / np.hypot(unit_m, part.shared_stddev_m)) for x in passed]
+    off_m = [predicted_ranges(part, state) - part.range_m for state in passed]
+    noises = [inlier_noise(each / np.hypot(unit_m, shared_m)) for each in off_m]
     best = int(np.argmax([noise.log_likelihood for noise in noises]))
     return passed[best], noises[best].stddev
 
 
-def _distinct(points: list[Array], noise_m: float) -> list[Array]:
-    """Return the first of each group of points that ranges with this noise do not tell apart."""
-    kept: list[Array] = []
-    for x in points:
-        if all(np.linalg.norm(x - other) > noise_m for other in kept):
-            kept.append(x)
+def _distinct(states: list[RangeState], noise_m: float) -> list[RangeState]:
+    """Return the first of each group of states that ranges with this noise do not tell apart."""
+    kept: list[RangeState] = []
+    for each in states:
+        off_m = [np.append(each.anchors_m - other.anchors_m, each.bias_m - other.bias_m) for other in kept]
+        if all(np.linalg.norm(of) > noise_m for of in off_m):
+            kept.append(each)
     return kept
 
 
-def _starts(problem: PointProblem) -> list[Array]:
+def _starts(problem: RangeProblem) -> list[RangeState]:
     """Return starting points around the mean of the tag's positions, and the linear solution with its mirror image."""
-    bias = problem.prior_mean[3]
-    ranges = problem.range_m - bias
-    shape = path_shape(problem.positions_m)
-    linear, _ = multilaterate(problem.positions_m, ranges)
+    tags_m, known_m = problem.tag_from_center, problem.anchor_mean_m
+    ranges = problem.range_m - problem.bias_mean_m[0]
+    shape = path_shape(tags_m)
+    linear, _ = multilaterate(tags_m, ranges)
     normal = shape.axes[:, 2]
     mirrored = linear - 2 * ((linear - shape.centroid) @ normal) * normal
-    around = shape.centroid + np.median(ranges) * _directions()
-    return [np.append(point, bias) for point in (*around, linear, mirrored)]
+    places_m = np.vstack([shape.centroid + np.median(ranges) * _directions(), linear, mirrored])
+    places_m = np.where(np.isnan(known_m), places_m, known_m)
+    return [RangeState(IDENTITY, place_m[None], problem.bias_mean_m) for place_m in places_m]
 
 
 def _directions() -> Array:
@@ -271,13 +248,13 @@ class JudgedFit:
     """A fit with the covariance of the errors of its n ranges.
 
     Attributes:
-        fit: the fit.
+        point: the fit.
         of_bin: (n,) index of each range's bin.
         covariance_m2: (c, c) covariance of the errors of all bins.
         inflation_of_prior: factor by which the prior in the fit was strengthened.
     """
 
-    fit: PointFit
+    point: PointFit
     of_bin: Indices
     covariance_m2: Array
     inflation_of_prior: float = 1.0
@@ -294,7 +271,7 @@ class JudgedFit:
         Args:
             change_m: (n,) change of the ranges per unit of the parameter, metres.
         """
-        weight = self.fit.weights * change_m / self.fit.problem.stddev_m**2
+        weight = self.point.fit.weights * change_m / self.point.problem.stddev_m**2
         formal = float(weight @ change_m)
         return float(np.sqrt(max(self.of_sums(weight[None])[0, 0] / formal, 1.0))) if formal > 0 else 1.0
 
@@ -303,50 +280,48 @@ class JudgedFit:
 
         It is strengthened by the inflation of the bias, with the position estimated along with it.
         """
-        fit, problem = self.fit, self.fit.problem
-        root, slopes = np.sqrt(fit.weights) / problem.stddev_m, problem.slopes(fit.x)
-        adapted = np.linalg.lstsq(root[:, None] * slopes[:, :3], root, rcond=None)[0]
-        inflation = self.inflation(1.0 - slopes[:, :3] @ adapted)
-        problem = replace(problem, prior=problem.prior * inflation)
-        return replace(self, fit=replace(fit, problem=problem, x=improve(problem, fit.x)), inflation_of_prior=inflation)
+        point, problem = self.point, self.point.problem
+        root, by_place = np.sqrt(point.fit.weights) / problem.stddev_m, point.slopes[:, :3]
+        adapted = np.linalg.lstsq(root[:, None] * by_place, root, rcond=None)[0]
+        inflation = self.inflation(1.0 - by_place @ adapted)
+        problem = replace(problem, bias_stddev_m=problem.bias_stddev_m / inflation)
+        return replace(self, point=replace(point, problem=problem).near(point.at_m), inflation_of_prior=inflation)
 
-    def judged_by(self, inflation: float) -> PointProblem:
+    def judged_by(self, inflation: float) -> RangeProblem:
         """Return the problem with standard deviations that account for common errors, for comparing costs."""
-        problem = self.fit.problem
-        prior = problem.prior / self.inflation_of_prior
-        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=prior)
+        problem = self.point.problem
+        bias_stddev_m = problem.bias_stddev_m * self.inflation_of_prior
+        return replace(problem, stddev_m=inflation * problem.stddev_m, bias_stddev_m=bias_stddev_m)
 
 
 def judged_fits(
-    fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], *, is_calibrated: bool
+    fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], curve_stddev_m: Array | None
 ) -> list[JudgedFit]:
     """Learn the errors of the ranges from the residuals of all fits together.
 
     Args:
         fits: the fits.
         times_s, tags: (n_k,) times and indices of tags of the ranges of each fit.
-        is_calibrated: whether an error curve has been subtracted, whose uncertainty the ranges share.
+        curve_stddev_m: as of ``radio_components``, of the ranges of all fits.
     """
-    lengths = [len(fit.residuals_m) for fit in fits]
+    lengths = [len(fit.own_stddev_m) for fit in fits]
     anchor_index = np.repeat(np.arange(len(fits)), lengths)
-    slopes = [fit.problem.slopes(fit.x) for fit in fits]
-    curve_stddev_m = np.concatenate([fit.problem.shared_stddev_m for fit in fits])
     precision = np.concatenate([fit.own_stddev_m**-2 for fit in fits])
     bins = range_bins(
         anchor_index,
         np.concatenate(tags),
         np.concatenate(times_s),
-        np.concatenate([fit.problem.positions_m - fit.x[:3] for fit in fits]),
+        np.concatenate([fit.problem.tag_from_center - fit.at_m for fit in fits]),
         np.tile(np.eye(3), (len(anchor_index), 1, 1)),
-        np.concatenate([fit.weights for fit in fits]) * precision / precision.mean(),
-        noisiness(anchor_index, np.concatenate([fit.residuals_m for fit in fits]), len(fits)),
+        np.concatenate([fit.fit.weights for fit in fits]) * precision / precision.mean(),
+        noisiness(anchor_index, np.concatenate([fit.fit.residuals_m for fit in fits]), len(fits)),
     )
     learned = learn_errors(
-        radio_components(bins, curve_stddev_m if is_calibrated else None, _NOT_HERE),
+        radio_components(bins, curve_stddev_m, _NOT_HERE),
         bins,
         off_m=bins.mean(np.concatenate([fit.off_m for fit in fits])),
-        design=bins.mean(block_diag(*slopes)),
-        prior_design=block_diag(*(fit.problem.prior for fit in fits)),
+        design=bins.mean(block_diag(*(fit.slopes for fit in fits))),
+        prior_design=block_diag(*(fit.prior() for fit in fits)),
         noise_m=float(precision.mean() ** -0.5),
     )
     covariance = learned.covariance_m2

@@ -20,15 +20,15 @@ from rangesfm.measurements.ranges.anchors.point_fit import (
     ENOUGH_TO_JUDGE,
     JudgedFit,
     PointFit,
-    PointProblem,
     fit_with_own_noise,
-    improve,
     judged_fits,
+    known_directions,
 )
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, cost_at, solve
 from rangesfm.util.geometry.numerics import UNDETERMINED
-from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, MIN_STDDEV_M, SAME_COST
+from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
 from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
 from rangesfm.util.processes.threads import with_one_blas_thread
 
@@ -38,8 +38,6 @@ MIN_NUM_RANGES = 4
 _NONLINEAR = 0.05
 # Distances at which the cost is then evaluated, metres.
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
-# Standard deviation of a known height.
-_HEIGHT_STDDEV_M = 0.01
 # Id of an anchor without one.
 _ONE = "anchor"
 
@@ -123,17 +121,25 @@ class AnchorRanges:
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
         """Find the most likely position, assuming independent errors of the ranges."""
-        middle = self.tag_positions_m.mean(axis=0)
-        mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
-        # A known bias is held by a prior that is far stronger than any ranges.
-        prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, MIN_STDDEV_M)]])
-        if self.height_m is not None:
-            mean[2] = self.height_m - middle[2]
-            prior = np.vstack([prior, [0.0, 0.0, 1 / _HEIGHT_STDDEV_M, 0.0]])
-        centred_m, shared_m = self.tag_positions_m - middle, self.shared_stddev_m
-        problem = PointProblem(centred_m, self.range_m, np.ones(len(self.range_m)), shared_m, mean, prior)
+        num, middle = len(self.range_m), self.tag_positions_m.mean(axis=0)
+        height_m = np.nan if self.height_m is None else self.height_m - middle[2]
+        problem = RangeProblem(
+            centers=np.zeros((num, 3)),
+            tag_from_center=self.tag_positions_m - middle,
+            anchor_index=np.zeros(num, dtype=np.int64),
+            range_m=self.range_m,
+            stddev_m=np.ones(num),
+            anchor_mean_m=np.array([[np.nan, np.nan, height_m]]),
+            anchor_stddev_m=np.array([np.inf]),
+            bias_mean_m=np.array([options.range_bias_m]),
+            bias_stddev_m=np.array([options.range_bias_stddev_m]),
+            common_bias_stddev_m=0.0,
+            frame_is_free=False,
+            share=np.ones(num),
+        )
         given = self.range_stddev_m
-        return fit_with_own_noise(problem, np.where(np.isfinite(given), given, options.range_stddev_m or np.nan))
+        given = np.where(np.isfinite(given), given, options.range_stddev_m or np.nan)
+        return fit_with_own_noise(problem, self.shared_stddev_m, given)
 
 
 def walking_times_s(places_m: Array) -> Array:
@@ -250,8 +256,9 @@ def trilaterate_anchors(
         )
     fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
     times_s, tags = [anchors[name].times_s for name in fits], [anchors[name].tags for name in fits]
-    is_calibrated = log.shared_stddev_m is not None
-    judged = judged_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
+    is_calibrated = bool(fits) and log.shared_stddev_m is not None
+    curve_m = np.concatenate([anchors[name].shared_stddev_m for name in fits]) if is_calibrated else None
+    judged = judged_fits([*fits.values()], times_s, tags, curve_m) if fits else []
     fit_of, placements = dict(zip(fits, judged, strict=True)), []
     for name, anchor in anchors.items():
         num, found = len(anchor.range_m), None
@@ -273,50 +280,50 @@ def _conclude(anchor: AnchorRanges, found: JudgedFit, options: TrilaterationOpti
     across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
-        apart = (mirror - found.fit.x)[:3]
+        apart = mirror.at_m - found.point.at_m
         # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
         least = UNDETERMINED * float(np.linalg.norm(anchor.toward) * np.linalg.norm(apart))
         told = anchor.toward if abs(anchor.toward @ apart) > least else None
         # If both have the same cost, the choice would depend on rounding, so the order is fixed.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
-            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.fit.x
+            found, mirror = replace(found, point=mirror), found.point
             covariance = _covariance(found)
         mirror = mirror if told is None else None
     middle = anchor.tag_positions_m.mean(axis=0)
     return Trilateration(
-        position_m=middle + found.fit.x[:3],
+        position_m=middle + found.point.at_m,
         covariance_m2=covariance[:3, :3],
-        mirror_position_m=None if mirror is None else middle + mirror[:3],
-        range_bias_m=float(found.fit.x[3]),
-        range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
-        noise_stddev_m=found.fit.noise_m,
-        residuals_m=found.fit.residuals_m,
-        weights=found.fit.weights,
+        mirror_position_m=None if mirror is None else middle + mirror.at_m,
+        range_bias_m=found.point.bias_m,
+        range_bias_stddev_m=float(np.sqrt(np.diag(covariance)[3:].sum())),  # none if the bias is known
+        noise_stddev_m=found.point.noise_m,
+        residuals_m=found.point.fit.residuals_m,
+        weights=found.point.fit.weights,
     )
 
 
 def _covariance(found: JudgedFit) -> Array:
-    """Return the covariance (4, 4) of position and bias, given the errors of the ranges.
+    """Return the covariance (q, q) of the position and, unless it is known, the bias, given the errors of the ranges.
 
     It is the sandwich covariance of a robust estimate: the covariance of the gradient between two inverses of the
     information (Huber and Ronchetti, "Robust Statistics", 2009, section 6.3). The weakest direction may instead be
     evaluated by the cost itself.
     """
-    problem, weights = found.fit.problem, found.fit.weights
-    jacobian = problem.jacobian(found.fit.x)
-    of_prior = problem.prior.T @ problem.prior
+    point, weights, stddev_m = found.point, found.point.fit.weights, found.point.problem.stddev_m
+    jacobian, prior = point.slopes / stddev_m[:, None], point.prior(found.inflation_of_prior)
+    of_prior = prior.T @ prior
     inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
-    influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
+    influence = inverse @ (jacobian * (weights / stddev_m)[:, None]).T
     sandwich = found.of_sums(influence) + found.inflation_of_prior**2 * inverse @ of_prior @ inverse
     return _with_weak_direction(found, sandwich, inverse)
 
 
 def _inverse(information: Array) -> Array:
-    # Position and bias are scaled to units of their own. In metres, the large information of a known bias would hide
-    # that of the position.
+    # Position and bias are scaled to units of their own. In metres, the large information of a bias that is known well
+    # would hide that of the position.
     strongest = np.diag(information)
-    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3]))
+    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3:]))
     values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
     inverse: Array = unit[:, None] * ((vectors / np.maximum(values, 1e-12)) @ vectors.T) * unit
     return inverse
@@ -329,33 +336,32 @@ def _with_weak_direction(found: JudgedFit, sandwich: Array, formal: Array) -> Ar
     farther off.
     """
     variances, axes = np.linalg.eigh(formal[:3, :3])
-    along = np.append(axes[:, 2], 0.0)
+    along = np.append(axes[:, 2], np.zeros(len(formal) - 3))
     # The other unknowns are assumed to change with this direction as the curvature says.
     tied = formal @ along / variances[2]
-    inflation = found.inflation(found.fit.problem.slopes(found.fit.x) @ tied)
-    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
+    inflation = found.inflation(found.point.slopes @ tied)
+    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.point.problem.range_m)):
         return sandwich
-    rest = np.eye(4) - np.outer(tied, along)
+    rest = np.eye(len(formal)) - np.outer(tied, along)
     changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
     return changed
 
 
 def _profile_stddev(found: JudgedFit, along: Array, inflation: float) -> float:
-    """Return the distance along a direction (4,) at which the cost has risen by that of one standard deviation, metres.
+    """Return the distance along a direction (q,) at which the cost has risen by that of one standard deviation, metres.
 
     The other unknowns are estimated anew at each distance.
     """
-    num = len(found.fit.problem.range_m)
+    num = len(found.point.problem.range_m)
     rows = np.linspace(0, num - 1, min(num, ENOUGH_TO_JUDGE)).astype(np.int64)
     part = found.judged_by(inflation).subset(rows)
-    hold = np.vstack([part.prior, along / MIN_STDDEV_M])  # as a known bias is held
-    best = improve(part, found.fit.x)
-    allowed = part.cost(best) + 0.5 * len(rows) / num
+    held = known_directions(part)
+    best = solve(part, found.point.fit.state, held=held)
+    allowed = best.cost + 0.5 * len(rows) / num
 
     def is_far(step: float) -> bool:
-        moved = best + step * along
-        held = replace(part, prior_mean=np.append(moved[:3], part.prior_mean[3]), prior=hold)
-        return held.cost(improve(held, moved)) > allowed
+        moved = replace(best.state, anchors_m=best.state.anchors_m + step * along[:3])
+        return solve(part, moved, held=(*held, np.append(0.0, along))).cost > allowed
 
     last = _PROFILE_STEPS_M[-1]
     return float(max(next((step for step in _PROFILE_STEPS_M if is_far(sign * step)), last) for sign in (1, -1)))
@@ -382,22 +388,21 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     )
 
 
-def _mirror(found: JudgedFit, covariance: Array, centroid: Array, across: Array) -> Array | None:
-    """Return position and bias (4,) of the mirror image in the tag's positions, if it is a different one and fits."""
-    height = float((found.fit.x[:3] - centroid) @ across)
-    other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
-    apart = (other - found.fit.x)[:3]
+def _mirror(found: JudgedFit, covariance: Array, centroid: Array, across: Array) -> PointFit | None:
+    """Return the fit of the mirror image in the tag's positions, if it is a different one and fits."""
+    at_m = found.point.at_m
+    other = found.point.near(at_m - 2 * float((at_m - centroid) @ across) * across)
+    apart = other.at_m - at_m
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
     return other if distance > 2 * stddev and _gap(found, other) < MIN_COST_GAP else None
 
 
-def _gap(found: JudgedFit, mirror: Array) -> float:
+def _gap(found: JudgedFit, mirror: PointFit) -> float:
     """Return the cost of the mirror image minus that of the fit, with common errors of the ranges accounted for.
 
     The loss is bounded, so that outliers cost the same for both.
     """
-    problem = found.fit.problem
-    inflation = found.inflation(problem.residuals_m(mirror) - found.fit.residuals_m)
-    judged = found.judged_by(inflation)
-    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
+    fit, other = found.point.fit, mirror.fit
+    judged = found.judged_by(found.inflation(other.residuals_m - fit.residuals_m))
+    return cost_at(judged, other.state, GEMAN_MCCLURE) - cost_at(judged, fit.state, GEMAN_MCCLURE)

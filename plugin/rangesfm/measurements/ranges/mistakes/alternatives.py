@@ -28,7 +28,6 @@ from rangesfm.measurements.ranges.scale.range_equation import (
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
 from rangesfm.solver.mistakes import in_axes
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
 
@@ -212,7 +211,7 @@ def _cost(problem: RangeProblem, state: RangeState) -> float:
 
 
 def _roughly_solved(problem: RangeProblem, start: RangeState) -> RangeFit:
-    return solve(problem, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=MAX_NUM_ROUNDS)
+    return solve(problem, start, loss=CAUCHY, tolerance=1e-4)
 
 
 def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:

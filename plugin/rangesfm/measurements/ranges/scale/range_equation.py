@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -31,6 +32,8 @@ from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.util.geometry.rotations import left_jacobians
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+
+_MAX_NUM_EVALUATIONS = 100
 
 
 @dataclass(frozen=True)
@@ -247,9 +250,9 @@ def solve(
     start: RangeState,
     *,
     others: Sequence[RangeProblem] = (),
+    held: Sequence[Array] = (),
     loss: RobustLoss = CAUCHY,
     tolerance: float = ROUNDING,
-    max_num_evaluations: int = 100,
 ) -> RangeFit:
     """Solve by robust least squares, with scipy's trust region solver and an analytic Jacobian.
 
@@ -257,16 +260,19 @@ def solve(
         others: problems of further models, each in its own unit and with its own ``frame_is_free``. Anchors, biases
             and all priors are taken from the first problem.
         start: initial values; an anchor without a position must have no ranges.
+        held: directions (p,) in the parameters of ``columns_of`` along which the state stays where it starts.
         loss: robust loss of the ranges.
         tolerance: relative change of cost and of parameters at which the solver stops. Candidates to choose among need
             not be at the very minimum.
     """
     columns = columns_of((problem, *others))
-    system = _System((problem, *others), columns, start, loss)
+    num = columns[0].num
+    free = null_space(np.reshape(held, (-1, num))) if held else np.eye(num)
+    system = _System((problem, *others), columns, start, loss, free)
     result = least_squares(
-        lambda x: np.concatenate(system.residuals(state_after(columns, start, x))),
-        np.zeros(columns[0].num),
-        jac=lambda x: np.concatenate(system.jacobian(state_after(columns, start, x))),
+        lambda y: np.concatenate(system.residuals(system.state_after(y))),
+        np.zeros(free.shape[1]),
+        jac=lambda y: np.concatenate(system.jacobian(system.state_after(y))) @ free,
         loss=system.rho_with_derivatives,
         x_scale="jac",
         method="trf",
@@ -274,10 +280,16 @@ def solve(
         xtol=tolerance,
         # Only a start at the very minimum is below this; without it, the solver would divide zero by zero there.
         gtol=float(np.finfo(np.float64).eps),
-        max_nfev=max_num_evaluations,
+        max_nfev=_MAX_NUM_EVALUATIONS,
     )
-    x = _settled(system, result.x) if tolerance <= ROUNDING else result.x
-    return system.fit(state_after(columns, start, x), float(result.cost))
+    y = _settled(system, result.x) if tolerance <= ROUNDING else result.x
+    return system.fit(system.state_after(y), float(result.cost))
+
+
+def cost_at(problem: RangeProblem, state: RangeState, loss: RobustLoss = CAUCHY) -> float:
+    """Return half the robust sum of squares at a state, priors included."""
+    scaled = (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
+    return 0.5 * float(problem.share @ loss.rho(scaled**2)[0]) + prior_cost(problem, state)
 
 
 def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit:
@@ -286,10 +298,11 @@ def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit
     Args:
         weights: (n,) robust weights; larger than 1 for a range that stands for several.
     """
-    return _System((problem,), columns_of((problem,)), state, CAUCHY).fit(state, 0.0, weights)
+    columns = columns_of((problem,))
+    return _System((problem,), columns, state, CAUCHY, np.eye(columns[0].num)).fit(state, 0.0, weights)
 
 
-def _settled(system: _System, x: Array) -> Array:
+def _settled(system: _System, y: Array) -> Array:
     """Move to the exact minimum by Newton steps that use the gradient alone.
 
     The trust region stops where rounding hides the decrease of the cost, some 1e-9 from the minimum. On which side it
@@ -298,23 +311,31 @@ def _settled(system: _System, x: Array) -> Array:
     solver has not converged, and its result is left as it is.
     """
     for _ in range(MAX_NUM_ROUNDS):
-        gradient, curvature = system.slope(state_after(system.columns, system.start, x))
+        gradient, curvature = system.slope(system.state_after(y))
         step = np.linalg.lstsq(curvature, gradient, rcond=ROUNDING)[0]
         gain = float(gradient @ step)
         if not ROUNDING**2 < gain < SAME_COST:
             break
-        x = x - step
-    return x
+        y = y - step
+    return y
 
 
 @dataclass(frozen=True)
 class _System:
-    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state."""
+    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state.
+
+    The state moves along (p, q) ``free`` directions only.
+    """
 
     parts: tuple[RangeProblem, ...]
     columns: tuple[Columns, ...]
     start: RangeState
     loss: RobustLoss
+    free: Array
+
+    def state_after(self, y: Array) -> RangeState:
+        """Return the start moved by (q,) steps along the free directions."""
+        return state_after(self.columns, self.start, self.free @ y)
 
     @property
     def share(self) -> Array:
@@ -340,14 +361,15 @@ class _System:
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
 
     def slope(self, state: RangeState) -> tuple[Array, Array]:
-        """Return the (p,) gradient and the (p, p) curvature of the cost.
+        """Return the (q,) gradient and the (q, q) curvature of the cost along the free directions.
 
         As in scipy, a range beyond the inflection point of the loss adds no curvature.
         """
         (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
         _, first, second = self.rho_with_derivatives(scaled**2)
         curvature = (jacobian * np.maximum(first + 2 * second * scaled**2, 0.0)[:, None]).T @ jacobian
-        return jacobian.T @ (first * scaled) + of_priors.T @ off_priors, curvature + of_priors.T @ of_priors
+        gradient = jacobian.T @ (first * scaled) + of_priors.T @ off_priors
+        return self.free.T @ gradient, self.free.T @ (curvature + of_priors.T @ of_priors) @ self.free
 
     def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
         """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
