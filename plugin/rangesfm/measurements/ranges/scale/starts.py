@@ -18,9 +18,15 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_SEARCH, multilaterate
-from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeProblem,
+    RangeState,
+    antenna_positions,
+    cost_at,
+    solve,
+)
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS, UNDETERMINED
-from rangesfm.util.geometry.robust_statistics import SAME_COST, robust_stddevs
+from rangesfm.util.geometry.robust_statistics import SAME_COST
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of
 from rangesfm.util.processes.threads import side_by_side
 
@@ -28,8 +34,9 @@ _T = TypeVar("_T")
 
 # Number of scales of a sweep, and the largest over the smallest.
 _NUM_SCALES, _SCALE_SPAN = 80, 200.0
-# Numbers of rotations of a sweep, without and with a known vertical: the latter are 6 degrees apart.
-_NUM_ROTATIONS, _NUM_HEADINGS = 400, 60
+# Numbers of rotations of a sweep, without and with a known vertical: the latter are 6 degrees apart. Rounds of
+# reweighting for each.
+_NUM_ROTATIONS, _NUM_HEADINGS, _NUM_ROUNDS = 400, 60, 4
 MAX_NUM_STARTS = 12
 """Most candidates of a search that are refined: of a sweep by each kind of residuals, a consensus, or triples."""
 # Trials closer to each other than this, in the logarithm of the scale and in radians, converge to the same minimum.
@@ -195,7 +202,7 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         first, second = (fit.state for fit in fits)
         middle = 0.5 * (first.anchors_m + second.anchors_m), 0.5 * (first.bias_m + second.bias_m)
         # Both starts may lead to one place, up to the tolerance; then the cost has no ridge between the two.
-        if solve(alone, RangeState(IDENTITY, *middle), max_num_evaluations=1).cost > max(fit.cost for fit in fits):
+        if cost_at(alone, RangeState(IDENTITY, *middle)) > max(fit.cost for fit in fits):
             rise[k] = fits[1].cost - fits[0].cost
     return replace(state, anchors_m=anchors), others, rise
 
@@ -247,30 +254,14 @@ def multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Arra
 def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tuple[Array, Array]:
     """Return the best translation for each rotation, and a robust cost.
 
-    With q = anchor - R (scale c + r): rho^2 = |t|^2 - 2 t.q + |q|^2 is linear in (t, |t|^2).
+    It is a point at the ranges from all places anchor - R (scale c + r).
     """
-    path = scale * problem.centers + problem.tag_from_center
-    anchors = problem.anchor_mean_m[problem.anchor_index]
+    anchors, path = problem.anchor_mean_m[problem.anchor_index], scale * problem.centers + problem.tag_from_center
     ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
-    q = anchors.T - rotations @ path.T  # (rotations, 3, ranges)
-    squared = ranges**2 - np.einsum("rin,rin->rn", q, q)
-    design = np.concatenate([-2 * q, np.ones_like(squared)[:, None]], axis=1)
-    weights = 1 / np.maximum(2 * ranges, 1e-3)
-    robust = np.ones_like(squared)
-    ridge = 1e-9 * np.eye(4)
-    for num_left in reversed(range(4)):
-        weighted = design * (weights**2 * robust)[:, None]
-        normal = weighted @ np.swapaxes(design, 1, 2)
-        normal = normal + ridge * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-        solution = np.linalg.solve(normal, weighted @ squared[..., None])
-        if num_left:
-            residuals = weights * ((np.swapaxes(solution, 1, 2) @ design)[:, 0] - squared)
-            robust = 1 / (1 + (residuals / (2 * robust_stddevs(residuals))) ** 2)
-    translation = solution[:, :3]
-    from_path = q - translation
-    off = np.abs(np.sqrt(np.einsum("rin,rin->rn", from_path, from_path)) - ranges)
-    costs = np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)
-    return translation[..., 0], costs
+    places = anchors - path @ np.swapaxes(rotations, 1, 2)
+    translations, _ = multilaterate(places, ranges, _NUM_ROUNDS)
+    off = np.abs(np.linalg.norm(places - translations[:, None], axis=2) - ranges)
+    return translations, np.mean(np.minimum(off, 3 * np.median(off, axis=1, keepdims=True)), axis=1)
 
 
 def consensus_scales(problem: RangeProblem) -> list[float]:
