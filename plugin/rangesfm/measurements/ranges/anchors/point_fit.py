@@ -295,22 +295,22 @@ class JudgedFit:
 
 
 def judged_fits(
-    fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], curve_stddev_m: Array | None
+    fits: Sequence[PointFit], times_s: Array, tag_index: Indices, curve_stddev_m: Array | None
 ) -> list[JudgedFit]:
     """Learn the errors of the ranges from the residuals of all fits together.
 
     Args:
         fits: the fits.
-        times_s, tags: (n_k,) times and indices of tags of the ranges of each fit.
-        curve_stddev_m: as of ``radio_components``, of the ranges of all fits.
+        times_s, tag_index: (n,) of the ranges of all fits, one below the other.
+        curve_stddev_m: (n,), as of ``radio_components``.
     """
     lengths = [len(fit.own_stddev_m) for fit in fits]
     anchor_index = np.repeat(np.arange(len(fits)), lengths)
     precision = np.concatenate([fit.own_stddev_m**-2 for fit in fits])
     bins = range_bins(
         anchor_index,
-        np.concatenate(tags),
-        np.concatenate(times_s),
+        tag_index,
+        times_s,
         np.concatenate([fit.problem.tag_from_center - fit.at_m for fit in fits]),
         np.tile(np.eye(3), (len(anchor_index), 1, 1)),
         np.concatenate([fit.fit.weights for fit in fits]) * precision / precision.mean(),

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.point_fit import (
@@ -88,58 +88,6 @@ class Trilateration:
     def position_stddev_m(self) -> float:
         """Root of the mean variance of the three coordinates, metres."""
         return float(np.sqrt(np.trace(self.covariance_m2) / 3))
-
-
-@dataclass(frozen=True)
-class AnchorRanges:
-    """n ranges of one anchor to known positions of the tag.
-
-    Attributes:
-        tag_positions_m: (n, 3) positions of the tag's antenna.
-        range_m: (n,) measured ranges.
-        range_stddev_m: (n,) noise of each range, NaN where unknown.
-        shared_stddev_m: (n,) standard deviation of the error that ranges of about this length share.
-        times_s: (n,) times of the ranges. tags: (n,) index of each range's tag.
-        toward: (3,) direction from the anchor's mirror image to the anchor; zero if it is not known.
-        height_m: z of the anchor, if it is known.
-    """
-
-    tag_positions_m: Array
-    range_m: Array
-    range_stddev_m: Array
-    shared_stddev_m: Array
-    times_s: Array
-    tags: Indices
-    toward: Array
-    height_m: float | None
-
-    @property
-    def shape(self) -> PathShape:
-        """Shape of the tag's positions about their mean; if the anchor's height is known, of their horizontal parts."""
-        centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
-        return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
-
-    def fit(self, options: TrilaterationOptions) -> PointFit:
-        """Find the most likely position, assuming independent errors of the ranges."""
-        num, middle = len(self.range_m), self.tag_positions_m.mean(axis=0)
-        height_m = np.nan if self.height_m is None else self.height_m - middle[2]
-        problem = RangeProblem(
-            centers=np.zeros((num, 3)),
-            tag_from_center=self.tag_positions_m - middle,
-            anchor_index=np.zeros(num, dtype=np.int64),
-            range_m=self.range_m,
-            stddev_m=np.ones(num),
-            anchor_mean_m=np.array([[np.nan, np.nan, height_m]]),
-            anchor_stddev_m=np.array([np.inf]),
-            bias_mean_m=np.array([options.range_bias_m]),
-            bias_stddev_m=np.array([options.range_bias_stddev_m]),
-            common_bias_stddev_m=0.0,
-            frame_is_free=False,
-            share=np.ones(num),
-        )
-        given = self.range_stddev_m
-        given = np.where(np.isfinite(given), given, options.range_stddev_m or np.nan)
-        return fit_with_own_noise(problem, self.shared_stddev_m, given)
 
 
 def walking_times_s(places_m: Array) -> Array:
@@ -241,56 +189,75 @@ def trilaterate_anchors(
     Returns:
         One placement for each anchor, in the order of the log.
     """
-    known, anchors = np.isfinite(tag_positions_m).all(axis=1), dict[str, AnchorRanges]()
+    num = len(log.anchor_ids)
+    rows = np.flatnonzero(np.isfinite(tag_positions_m).all(axis=1))
+    counts = np.bincount(log.anchor_index[rows], minlength=num)
+    rows = rows[np.argsort(log.anchor_index[rows], kind="stable")]
+    rows = rows[counts[log.anchor_index[rows]] >= MIN_NUM_RANGES]
+    index, shared_m, given_m = log.anchor_index[rows], shared_stddev(log)[rows], log.range_stddev_m[rows]
+    tags_m, found = tag_positions_m[rows], dict[int, JudgedFit]()
+    middle = tags_m.mean(axis=0) if len(rows) else np.zeros(3)
+    heights_m = np.array([height_m.get(anchor_id, np.nan) for anchor_id in log.anchor_ids])
+    problem = RangeProblem(
+        centers=np.zeros((len(rows), 3)),
+        tag_from_center=tags_m - middle,
+        anchor_index=index,
+        range_m=log.range_m[rows],
+        stddev_m=np.ones(len(rows)),
+        anchor_mean_m=np.column_stack([np.full((num, 2), np.nan), heights_m - middle[2]]),
+        anchor_stddev_m=np.full(num, np.inf),
+        bias_mean_m=np.full(num, options.range_bias_m),
+        bias_stddev_m=np.full(num, options.range_bias_stddev_m),
+        common_bias_stddev_m=0.0,
+        frame_is_free=False,
+        share=np.ones(len(rows)),
+    )
+    if len(rows):
+        given_m = np.where(np.isfinite(given_m), given_m, options.range_stddev_m or np.nan)
+        heard = np.unique(index)
+        fits = [fit_with_own_noise(problem.of_anchor(k), shared_m[index == k], given_m[index == k]) for k in heard]
+        by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if log.timestamp_s is None else []
+        times_s = np.concatenate(by_walk) if log.timestamp_s is None else log.timestamp_s[rows]
+        curve_m = None if log.shared_stddev_m is None else shared_m
+        found = dict(zip(heard.tolist(), judged_fits(fits, times_s, log.tag_index[rows], curve_m), strict=True))
+    placements = []
     for k, anchor_id in enumerate(log.anchor_ids):
-        own = np.flatnonzero(known & (log.anchor_index == k))
-        anchors[anchor_id] = AnchorRanges(
-            tag_positions_m[own],
-            log.range_m[own],
-            log.range_stddev_m[own],
-            shared_stddev(log)[own],
-            walking_times_s(tag_positions_m[own]) if log.timestamp_s is None else log.timestamp_s[own],
-            log.tag_index[own],
-            np.asarray(toward.get(anchor_id, np.zeros(3)), np.float64),
-            height_m.get(anchor_id),
-        )
-    fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
-    times_s, tags = [anchors[name].times_s for name in fits], [anchors[name].tags for name in fits]
-    is_calibrated = bool(fits) and log.shared_stddev_m is not None
-    curve_m = np.concatenate([anchors[name].shared_stddev_m for name in fits]) if is_calibrated else None
-    judged = judged_fits([*fits.values()], times_s, tags, curve_m) if fits else []
-    fit_of, placements = dict(zip(fits, judged, strict=True)), []
-    for name, anchor in anchors.items():
-        num, found = len(anchor.range_m), None
-        why_not = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
-        if name in fits:
+        placed, why_not = None, f"{counts[k]} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
+        if k in found:
             try:
-                found, why_not = _conclude(anchor, fit_of[name].balanced(), options), ""
+                told = np.asarray(toward.get(anchor_id, np.zeros(3)), np.float64)
+                placed, why_not = _conclude(found[k].balanced(), middle, told, options), ""
             except GeometryError as error:
                 why_not = str(error)
-        placements.append(AnchorPlacement(name, num, found, why_not))
+        placements.append(AnchorPlacement(anchor_id, int(counts[k]), placed, why_not))
     return tuple(placements)
 
 
-def _conclude(anchor: AnchorRanges, found: JudgedFit, options: TrilaterationOptions) -> Trilateration:
-    covariance, shape = _covariance(found), anchor.shape
+def _conclude(found: JudgedFit, middle: Array, toward: Array, options: TrilaterationOptions) -> Trilateration:
+    """Return the position with its mirror image, in a frame in which ``middle`` is the problem's origin.
+
+    Raises:
+        GeometryError: the position is less certain than wanted.
+    """
+    covariance, tags_m = _covariance(found), found.point.problem.tag_from_center
+    height_is_known = bool(np.isfinite(found.point.problem.anchor_mean_m[0, 2]))
+    shape = path_shape(tags_m * [1.0, 1.0, 0.0] if height_is_known else tags_m)
     _refuse_uncertain(covariance, shape, options)
     # With a known height, position and mirror image have the same height, and the plane between them is vertical.
     level = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
-    across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
+    across = oriented(level[:, None])[:, 0] if height_is_known else shape.axes[:, 2]
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
         apart = mirror.at_m - found.point.at_m
         # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
-        least = UNDETERMINED * float(np.linalg.norm(anchor.toward) * np.linalg.norm(apart))
-        told = anchor.toward if abs(anchor.toward @ apart) > least else None
+        least = UNDETERMINED * float(np.linalg.norm(toward) * np.linalg.norm(apart))
+        told = toward if abs(toward @ apart) > least else None
         # If both have the same cost, the choice would depend on rounding, so the order is fixed.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
             found, mirror = replace(found, point=mirror), found.point
             covariance = _covariance(found)
         mirror = mirror if told is None else None
-    middle = anchor.tag_positions_m.mean(axis=0)
     return Trilateration(
         position_m=middle + found.point.at_m,
         covariance_m2=covariance[:3, :3],
