@@ -57,9 +57,9 @@ _STEPS_M = (0.1, 0.01)
 _ROUNDING = np.finfo(np.float32).eps  # of a log with 32-bit numbers, relative
 
 
-def short_range_stddev(range_m: Array) -> Array:
-    """Return the (n,) standard deviation, metres, of the systematic error of short ranges."""
-    return _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
+def short_range_stddev(distance_m: Array) -> Array:
+    """Return the (n,) standard deviation, metres, of the systematic error of ranges at short distances."""
+    return _SHORT_RANGE_STDDEV_M * np.exp(-distance_m / SHORT_RANGE_LENGTH_M)
 
 
 def shared_stddev(log: RangeLog) -> Array:
