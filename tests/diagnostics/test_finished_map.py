@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +16,7 @@ from rangesfm.diagnostics.finished_map import doubts_of_points, place_of_map
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.options import ScaleOptions
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS
 from rangesfm.util.geometry.similarity import similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -57,7 +56,7 @@ def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: Ma
     walked = make_survey(num_epochs=4, radio=RADIO, seed=seed)
     estimate = walked.scale("site", tuple(walked.anchors_m), options=OPTIONS)
     assert doubts_of_points(GOOD_POINTS) == ()
-    place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
+    place = known(place_of_map(estimate, UNKNOWN_ERRORS, path_in_site(walked, estimate), [], NOT_BENT))
     assert place.verdict == "good"
     off_m = path_in_site(walked, estimate).centers - walked.centers_m
     assert np.all(np.abs(off_m.mean(axis=0)) < 4 * np.array(place.stddev_m))
@@ -68,7 +67,7 @@ def test_points_that_are_not_of_the_photos_are_said_of_the_place_too(walked: Sur
     (doubt,) = doubts_of_points(PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8))
     assert doubt.reason.startswith("the map's points lie 82 px (median) from where the photos show them")
     assert doubt.advice
-    place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [doubt.reason], NOT_BENT))
+    place = known(place_of_map(estimate, UNKNOWN_ERRORS, path_in_site(walked, estimate), [doubt.reason], NOT_BENT))
     assert (place.verdict, place.reasons) == ("doubtful", (doubt.reason,))
 
 
@@ -77,7 +76,9 @@ def test_a_wide_place_is_doubtful(walked: Survey, estimate: ScaleEstimate, what:
     placement = np.zeros((7, 7))
     placement[(slice(4, 7),) * 2 if what == "shift" else (3, 3)] = np.eye(3) * 0.5**2 if what == "shift" else 0.03**2
     place = known(
-        place_of_map(replace(estimate, placement=placement), None, path_in_site(walked, estimate), [], NOT_BENT)
+        place_of_map(
+            replace(estimate, placement=placement), UNKNOWN_ERRORS, path_in_site(walked, estimate), [], NOT_BENT
+        )
     )
     assert place.verdict == "doubtful"
     if what == "shift":
@@ -99,7 +100,7 @@ def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) ->
         estimate = walked.scale("site", tuple(walked.anchors_m), log=log, options=OPTIONS)
         uncertainty = estimate.uncertainty
         widening = uncertainty.half_width_95 / (1.96 * uncertainty.formal)
-        place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
+        place = known(place_of_map(estimate, UNKNOWN_ERRORS, path_in_site(walked, estimate), [], NOT_BENT))
         off_m = (path_in_site(walked, estimate).centers - walked.centers_m).mean(axis=0)
         squares.append((off_m / (np.array(place.stddev_m) / widening)) ** 2)
     # The mean of 18 chi-squares with one degree of freedom each is beyond this in one case of a thousand.
@@ -108,7 +109,7 @@ def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) ->
 
 def test_a_map_in_the_first_cameras_frame_has_no_place(walked: Survey) -> None:
     estimate = walked.scale("unknown")
-    assert place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT) is None
+    assert place_of_map(estimate, UNKNOWN_ERRORS, path_in_site(walked, estimate), [], NOT_BENT) is None
 
 
 def test_motions_of_a_similarity_are_its_derivatives() -> None:
@@ -117,19 +118,3 @@ def test_motions_of_a_similarity_are_its_derivatives() -> None:
     np.testing.assert_allclose(motions @ np.eye(7)[0], points)
     np.testing.assert_allclose(motions @ [0, 0.1, 0.2, 0.3, 0, 0, 0], np.cross([0.1, 0.2, 0.3], points))
     np.testing.assert_allclose(motions @ np.eye(7)[5], np.tile(np.eye(3)[1], (5, 1)))
-
-
-def moved(centers_m: Array, step: Array) -> Array:
-    """Centres after a small scaling and turn about the first one, and a shift."""
-    off_m = centers_m - centers_m[0]
-    return np.asarray(centers_m + step[0] * off_m + np.cross(step[1:4], off_m) + step[4:])
-
-
-CENTERS_M = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
-# Frames are numbered against the time.
-FRAME_IDS = np.array([3, 5, 7])
-PATH = Trajectory(FRAME_IDS[::-1], ("a", "b", "c"), None, CENTERS_M, np.array([np.eye(3)] * 3))
-
-
-def place(estimate: Any, summary: Any = None, doubts: Sequence[str] = (), bent_by_m: Array = NOT_BENT) -> Any:
-    return known(place_of_map(estimate, summary, PATH, doubts, bent_by_m))

@@ -16,7 +16,7 @@ from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.measurements.lengths.tape import CLICKED_STDDEV_PX, Marker
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests
-from rangesfm.util.geometry.map_errors import MapPoint
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapPoint
 
 STDDEV_M, NUM_POINTS = 0.01, 6
 
@@ -37,7 +37,7 @@ class Marked:
         at_m = at_m if wrong_m is None else at_m + wrong_m
         points = tuple(ControlPoint(f"M{k}", at, STDDEV_M, kind, k + 2) for k, at in enumerate(at_m))
         placed = Placed(placed_stddev**2 * np.eye(7), np.array(SITE_M), 0.0)
-        return diagnose_points(ControlPoints(points, self.markers), self.model, None, 0.0, placed)
+        return diagnose_points(ControlPoints(points, self.markers), self.model, UNKNOWN_ERRORS, 0.0, placed)
 
 
 @pytest.fixture(scope="module")
@@ -93,11 +93,11 @@ def test_what_the_stated_errors_explain_is_not_named(marked: Marked) -> None:
 def test_a_single_point_is_tested_and_no_point_is_none(marked: Marked) -> None:
     alone = ControlPoint("M0", marked.true_m[0] + [0, 0, 3.0], STDDEV_M, "control", 2)
     placed = Placed(1e-6 * np.eye(7), np.array(SITE_M), 0.0)
-    found = diagnose_points(ControlPoints((alone,), marked.markers), marked.model, None, 0.0, placed)
+    found = diagnose_points(ControlPoints((alone,), marked.markers), marked.model, UNKNOWN_ERRORS, 0.0, placed)
     assert [test.rejected for test in found.tests] == [True]
     assert np.isnan(found.tests[0].effect_on_scale)
     unseen = ControlPoints((ControlPoint("elsewhere", np.zeros(3), STDDEV_M, "check", 2),))
-    assert diagnose_points(unseen, marked.model, None, 0.0, placed).tests == ()
+    assert diagnose_points(unseen, marked.model, UNKNOWN_ERRORS, 0.0, placed).tests == ()
 
 
 def rejected(rows: Sequence[MistakeTest]) -> list[str]:

@@ -66,7 +66,6 @@ def test_parts_of_a_map_err_as_functions_of_it_that_were_not_observed(frame_is_f
     at_rest = JointMap((), path, IDENTITY, bending, True, {"seen": seen, "centers": centers}, problem, known)
     rest: Any = SimpleNamespace(refined_params={}, blocks={("anchor", "A1"): np.zeros(3)})
     errors = errors_at_estimate(at_rest, rest, ["A1", "unheard"])
-    assert errors is not None
     expected = problem.predicted_m2("centers", known.covariance)
     frames = errors.parts["frame"]
     modes = frames.modes[[frames.row_of[frame_id] for frame_id in path.frame_ids.tolist()], 3:].reshape(3 * NUM, -1)

@@ -13,7 +13,6 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.estimation.scale.robust_scale import metric_from_sfm_by_robust_weights
-from tests.known import known
 from tests.known_errors import known_errors, predicted_by_model
 from tests.simulated.model import synthetic_model
 from tests.simulated.outliers import spoilt
@@ -397,7 +396,7 @@ class TestDistances:
         assert abs(survey.scale_error(free)) < 0.01
         residuals_m = summary.ranges.predicted_m - told["observations"].log.range_m
         assert np.median(np.abs(residuals_m)) < 2 * RANGE_STDDEV_M
-        covariance = known(summary.covariance)
+        covariance = summary.covariance
         assert 0.005 < covariance.scale_stddev < 0.02
 
     def test_control_distances_between_markers_do_so_as_well_and_leave_no_trace(self) -> None:
@@ -606,7 +605,7 @@ class TestCovariance:
             )
             refined, summary = survey.refine(survey.anchors(0.0), errors=noise_m)
             off = survey.centers(refined) - survey.centers_m
-            covariances = known(summary.covariance).centers_m2(survey.trajectory.frame_ids)
+            covariances = summary.covariance.centers_m2(survey.trajectory.frame_ids)
             squares += [e @ np.linalg.solve(c, e) for e, c in zip(off, covariances, strict=True)]
         assert 0.5 < np.mean(squares) / 3 < 2.0
 
@@ -620,7 +619,7 @@ class TestCovariance:
     def test_none_is_found_where_none_is_wanted(self) -> None:
         survey = make_survey(pixel_stddev=0.5)
         _, summary = survey.refine(survey.anchors(0.0), options=RefineOptions(covariance=False))
-        assert summary.covariance is None
+        assert not summary.covariance.are_known
 
 
 class TestProblem:

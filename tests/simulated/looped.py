@@ -269,7 +269,6 @@ class SimulatedMap:
     @cached_property
     def finder(self) -> LoopFinder:
         covariance = joint_errors(self.at_rest, 1.0)
-        assert covariance is not None
         pixel_stddev = self.at_rest.pixel_stddev
         return LoopFinder.in_refined_map(self.model, self.scaled.trajectory, covariance, pixel_stddev, seed=0)
 

@@ -293,8 +293,8 @@ def covariances_of(metric: MetricResult) -> Values:
         found["covariance placement"] = metric.estimate.placement
     if find_kind(metric.kinds, PositionScale) is not None:
         found["covariance by positions"] = metric.all_measured.posterior.place
-    joint = None if metric.kept is None else metric.kept.summary.covariance
-    if joint is not None:
+    joint = metric.map_errors
+    if joint.are_known:
         found |= {"covariance centers": joint.centers_m2(metric.trajectory.frame_ids)}
         found |= {f"covariance {kind}s": joint.covariances(kind) for kind in joint.parts}
     return found

@@ -140,7 +140,7 @@ def told(name: str, seed: int) -> Line:
         metric = run_stages(survey, own_seed)
     except (GeometryError, SolverError) as error:
         return {**line, "refused": str(error)}
-    if metric.map_errors is None:
+    if not metric.map_errors.are_known:
         return {**line, "refused": "no refined map with a covariance"}
     model = truth.model
     markers, true_m = marks_in(truth, rng)

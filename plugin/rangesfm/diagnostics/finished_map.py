@@ -69,7 +69,7 @@ def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Dou
 
 def place_of_map(
     estimate: ScaleEstimate,
-    errors: MapErrors | None,
+    errors: MapErrors,
     path: Trajectory,
     doubts: Sequence[str],
     bent_by_m: Array,
@@ -77,7 +77,7 @@ def place_of_map(
     """Return the map's place in the site's frame with its uncertainty; None if the frame is the first camera's.
 
     Args:
-        errors: of the refined map; None for a map that is only scaled, or where they are not known.
+        errors: of the refined map; not known for a map that is only scaled.
         path: of the n keyframes in the final map, the first in time first.
         doubts: about the map, in words; with any of them its place is doubtful too.
         bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
@@ -86,11 +86,11 @@ def place_of_map(
         return None
     centers_m = path.centers
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
-    if errors is not None:
+    if errors.are_known:
         of_keyframes = errors.centers_m2(path.frame_ids)
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
-    bent_m2 = np.square(bent_by_m) if errors is None and len(bent_by_m) else 0.0
+    bent_m2 = np.square(bent_by_m) if not errors.are_known and len(bent_by_m) else 0.0
     keyframes_m = np.sqrt(keyframes_m2 + bent_m2)
     worst_m = float(keyframes_m.max())
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]

@@ -56,7 +56,7 @@ class Placed:
 def diagnose_points(
     points: ControlPoints,
     model: pycolmap.Reconstruction,
-    errors: MapErrors | None,
+    errors: MapErrors,
     scale_stddev: float,
     placed: Placed,
 ) -> MistakeTests:
@@ -68,7 +68,7 @@ def diagnose_points(
 
     Args:
         points: those left out already are not tested. model: the final one, in the site.
-        errors: of the refined map; None if it is not refined, or has none: those of ``placed``.
+        errors: of the refined map; where they are not known: those of ``placed``.
         scale_stddev: as for ``MapErrors.joint``.
     """
     is_seen = marks_seen(points, model)
@@ -77,8 +77,8 @@ def diagnose_points(
         return MistakeTests()
     named = NamedPoints.in_model(model, points.markers)
     found = [named.find_mark(of.name) for of in tested]
-    of_map = placed.joint(found) if errors is None else errors.joint(found, scale_stddev)
-    if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last
+    of_map = errors.joint(found, scale_stddev) if errors.are_known else placed.joint(found)
+    if errors.are_known and placed.by_antenna:  # the errors of the refined map have none that last
         of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])

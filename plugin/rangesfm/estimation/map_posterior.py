@@ -16,7 +16,7 @@ from rangesfm.solver.linear_map import Columns, regular
 from rangesfm.solver.normal_equations import HALF_A_REVOLUTION
 from rangesfm.solver.part_errors import PartSteps, map_errors, rows_of, steps_of
 from rangesfm.solver.posterior import JointProblem
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -42,7 +42,7 @@ def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
     return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)
 
 
-def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[str]) -> MapErrors | None:
+def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[str]) -> MapErrors:
     """Return how the parts of a map err that was bent and moved to its best estimate (section 7 of ``model.md``).
 
     Its photos bend it by a covariance P before anything is observed. With H the derivatives of the observations by
@@ -55,11 +55,11 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
         rest: the same map, with its equations. anchor_ids: in the order of the ranges' log.
 
     Returns:
-        None where the photos do not say how the map is bent.
+        errors that are not known where the photos do not say how the map is bent.
     """
     problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
     if not isinstance(bending, PhotoBending):
-        return None
+        return UNKNOWN_ERRORS
     columns, photos, variance = known.columns, bending.photos, _factor(problem) ** 2
     linear, noise = problem.among(problem.is_used)
     column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))

@@ -33,7 +33,7 @@ from rangesfm.solver.bundle_adjustment import (
 )
 from rangesfm.solver.covariance import joint_covariance
 from rangesfm.solver.normal_equations import NormalEquations
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.poses import Poses, model_poses
 
 # Largest number of solutions of the full problem, between which the noise is estimated again.
@@ -204,14 +204,14 @@ def _adjusted(adjustment: BundleAdjustment, start: Straightened, *, with_equatio
     )
 
 
-def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors | None:
-    """Return how the parts of a map at rest err, if each residual errs on its own; None where it is not determined.
+def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors:
+    """Return how the parts of a map at rest err, if each residual errs on its own; not known if it is not determined.
 
     Args:
         bending_factor: of the errors of all residuals.
     """
     if rest.equations is None:
-        return None
+        return UNKNOWN_ERRORS
     try:
         return joint_covariance(
             rest.equations,
@@ -222,4 +222,4 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors | None:
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)
-        return None
+        return UNKNOWN_ERRORS

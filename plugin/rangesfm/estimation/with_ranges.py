@@ -24,7 +24,7 @@ from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ran
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.util.geometry.gravity import Gravity
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
@@ -98,7 +98,7 @@ def refine_with_ranges(
             num_threads=num_threads,
         )
         rest = refine(problem)
-        covariance = joint_errors(rest, 1.0) if options.covariance else None
+        covariance = joint_errors(rest, 1.0) if options.covariance else UNKNOWN_ERRORS
     return metric, summarize(rest, covariance, 1.0)
 
 
@@ -145,8 +145,8 @@ class RefineSummary:
         message: of the solver.
         misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
         ranges: as the refined map has them.
-        covariance: how poses, cameras and anchors err together; None if not asked for, if the model is too large, or
-            if ranges and photos leave something undetermined.
+        covariance: how poses, cameras and anchors err together; not known if not asked for, if the model is too large,
+            or if ranges and photos leave something undetermined.
         bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
     """
 
@@ -162,7 +162,7 @@ class RefineSummary:
     message: str
     misfits: tuple[Doubt, ...]
     ranges: RefinedRanges
-    covariance: MapErrors | None
+    covariance: MapErrors
     bending_factor: float
 
     def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> RefineSummary:
@@ -175,7 +175,7 @@ class RefineSummary:
         return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
 
 
-def summarize(rest: MapAtRest, covariance: MapErrors | None, bending_factor: float) -> RefineSummary:
+def summarize(rest: MapAtRest, covariance: MapErrors, bending_factor: float) -> RefineSummary:
     """Summarise a refinement.
 
     Args:
@@ -200,7 +200,7 @@ def summarize(rest: MapAtRest, covariance: MapErrors | None, bending_factor: flo
 
 
 def refined_ranges(
-    rest: MapAtRest, state: MapState, covariance: MapErrors | None, moved: Similarity = IDENTITY
+    rest: MapAtRest, state: MapState, covariance: MapErrors, moved: Similarity = IDENTITY
 ) -> RefinedRanges:
     """Return the ranges of a log as a map has them that was at rest.
 
@@ -228,8 +228,8 @@ def refined_ranges(
     )
 
 
-def _with_stddevs(anchors: tuple[AnchorEstimate, ...], covariance: MapErrors | None) -> tuple[AnchorEstimate, ...]:
-    if covariance is None or "anchor" not in covariance.parts:
+def _with_stddevs(anchors: tuple[AnchorEstimate, ...], covariance: MapErrors) -> tuple[AnchorEstimate, ...]:
+    if "anchor" not in covariance.parts:
         return anchors
     variances = np.trace(covariance.covariances("anchor"), axis1=1, axis2=2) / 3
     variance_of = dict(zip(covariance.parts["anchor"].ids, variances.tolist(), strict=True))

@@ -68,7 +68,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
     with sole_writer(run.survey.output.path) as output:
         if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return metric
-        if metric.kept.summary.covariance is None:
+        if not metric.kept.summary.covariance.are_known:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return metric
         if why_not := matching.why_unfit(metric.final):
@@ -222,8 +222,9 @@ class _MetricMap(_MatchedMap):
     @cached_property
     def finder(self) -> LoopFinder | None:
         refined, path = self.metric.kept, self.metric.trajectory
-        if refined is None or (errors := refined.summary.covariance) is None:
+        if refined is None or not refined.summary.covariance.are_known:
             return None
+        errors = refined.summary.covariance
         seed = self.survey.output.seed
         return LoopFinder.in_refined_map(refined.model, path, errors, refined.summary.pixel_stddev, seed)
 
@@ -243,12 +244,12 @@ class _UnscaledMap(_MatchedMap):
 
     Attributes:
         trajectory: of its keyframes. at_rest: the model, with no measurements but its photos.
-        errors: of its poses; of the last map those before its loops were closed, which were larger. None: not known.
+        errors: of its poses; of the last map those before its loops were closed, which were larger.
     """
 
     trajectory: Trajectory
     at_rest: MapAtRest
-    errors: MapErrors | None
+    errors: MapErrors
 
     @property
     def model(self) -> pycolmap.Reconstruction:
@@ -256,7 +257,7 @@ class _UnscaledMap(_MatchedMap):
 
     @cached_property
     def finder(self) -> LoopFinder | None:
-        if self.errors is None:
+        if not self.errors.are_known:
             return None
         pixel_stddev, seed = self.at_rest.pixel_stddev, self.survey.output.seed
         return LoopFinder.in_refined_map(self.model, self.trajectory, self.errors, pixel_stddev, seed)
@@ -281,7 +282,7 @@ class _UnscaledMap(_MatchedMap):
         return pairs_alike(matching.database, known, matching.log, max_num=1, seed=self.survey.output.seed)
 
 
-def _errors_alone(at_rest: MapAtRest) -> MapErrors | None:
+def _errors_alone(at_rest: MapAtRest) -> MapErrors:
     """Return the errors of a map that is bent as much as photos usually bend maps, since nothing tells how much."""
     return joint_errors(at_rest, LARGEST_FACTOR)
 

@@ -113,7 +113,7 @@ def measure(
         raise InputError(f"{said}, so that no length in the map has one", result.path)
     points = _points_of(result, {} if markers is None else read_markers(markers))
     errors, up, stddev = result.read_map_errors(), result.summary.up, result.summary.scale.relative_stddev_empirical
-    notes = [] if errors is not None else [_SCALE_ALONE]
+    notes = [] if errors.are_known else [_SCALE_ALONE]
     notes += [] if up is not None else [_NO_HEIGHTS]
     for what, verdict in (("scale", result.summary.scale), ("place", result.summary.place)):
         if verdict is not None and verdict.verdict != "good":
@@ -124,14 +124,14 @@ def measure(
 def measured(
     points: NamedPoints,
     pairs: Iterable[tuple[str, str]],
-    errors: MapErrors | None,
+    errors: MapErrors,
     relative_scale_stddev: float,
     up: tuple[Array, float] | None,
 ) -> tuple[Measurement, ...]:
     """Measure between points of a map by name.
 
     Args:
-        errors: how its parts err together; None if that is not known. Then intervals come from the scale alone.
+        errors: how its parts err together; where that is not known, intervals come from the scale alone.
         relative_scale_stddev: standard deviation of its scale, divided by the scale, as it is stated.
         up: upward unit vector (3,) in the map and the standard deviation of its direction in radians; None if unknown.
 
@@ -145,10 +145,10 @@ def measured(
         first, second = (found[name] for name in ends)
         apart = second.position_m - first.position_m
         distance_m = float(np.linalg.norm(apart))
-        if errors is None:
-            covariance = relative_scale_stddev**2 * np.outer(apart, apart)
-        else:
+        if errors.are_known:
             covariance = errors.relative(first, second, relative_scale_stddev)
+        else:
+            covariance = relative_scale_stddev**2 * np.outer(apart, apart)
 
         def interval(value: float, along: Array, more_stddev: float = 0.0) -> Interval:
             half = NORMAL_95 * math.sqrt(max(float(along @ covariance @ along), 0.0) + more_stddev**2)
@@ -159,7 +159,7 @@ def measured(
         if up is not None:
             upward, tilt_stddev = up
             height = float(upward @ apart)
-            if errors is not None:
+            if errors.are_known:
                 level_m = float(np.linalg.norm(apart - height * upward))
                 of_height = interval(height, upward, tilt_stddev * level_m)
         return Measurement(ends, distance_m, (max(low, 0.0), high), height, of_height)

@@ -23,7 +23,7 @@ from rangesfm.sfm.loops.loop_closure import LoopClosure
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.util.geometry.georeference import Georeference
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -159,9 +159,11 @@ class MetricResult:
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
         """Return the covariance (3, 3) of each keyframe's projection centre by photo; empty if it is not known."""
-        if (errors := self.map_errors) is None:
+        if not self.map_errors.are_known:
             return {}
-        return dict(zip(self.trajectory.image_names, errors.centers_m2(self.trajectory.frame_ids), strict=True))
+        return dict(
+            zip(self.trajectory.image_names, self.map_errors.centers_m2(self.trajectory.frame_ids), strict=True)
+        )
 
     @property
     def upward(self) -> Array | None:
@@ -172,9 +174,9 @@ class MetricResult:
         return np.asarray(on_map.estimate.rotation @ on_map.path.world_from_cam[0] @ gravity.up_in_first_camera)
 
     @property
-    def map_errors(self) -> MapErrors | None:
-        """Return how the parts of the refined map err together; None if that is not known."""
-        return None if self.kept is None else self.kept.summary.covariance
+    def map_errors(self) -> MapErrors:
+        """Return how the parts of the refined map err together."""
+        return UNKNOWN_ERRORS if self.kept is None else self.kept.summary.covariance
 
     @property
     def georeference(self) -> Georeference | None:

@@ -26,6 +26,7 @@ from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map
 from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS
 from rangesfm.util.geometry.poses import model_poses
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
@@ -97,11 +98,11 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             on_map = on_map.without_clocks()
         factor = on_map.problem.bending_factor
         on_map = on_map.concluded()
-    covariance = None
+    covariance = UNKNOWN_ERRORS
     if options.covariance:
         anchor_ids = metric.observations.log.anchor_ids
         covariance = errors_at_estimate(on_map, rest, anchor_ids) if on_map.is_at_rest else joint_errors(rest, 1.0)
-        if covariance is None:
+        if not covariance.are_known:
             run.journal.warn(
                 "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
             )

@@ -162,7 +162,7 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
     if found.refined is None:
         return None
     why_broken, summary = found.refined.why_broken, found.refined.summary
-    ranges, covariance = summary.ranges, summary.covariance
+    ranges = summary.ranges
     others = {
         "kept": not why_broken,
         "why_not_kept": why_broken,
@@ -171,7 +171,7 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
         "correlation_inflation": ranges.errors.inflation,
         "converged": summary.converged,
         "scale_value": found.refined.scale,
-        "relative_scale_stddev": None if covariance is None else covariance.scale_stddev,
+        "relative_scale_stddev": summary.covariance.scale_stddev,
         "tag_in_cam_m": dict(zip(ranges.observations.log.tag_ids, ranges.tags_in_cam_m, strict=True)),
         "time_offset_change_s": ranges.time_shift_s,
         "short_range_error_m": ranges.short_range_error_m,

@@ -127,7 +127,7 @@ def _write_models_and_tables(survey: Survey, found: MetricResult, folder: Path) 
         write_model(found.final, folder / "sparse_metric" / "0")
     for table in tables_of(found):
         table.write(folder)
-    if found.map_errors is not None:
+    if found.map_errors.are_known:
         write_map_errors(found.map_errors, folder)
     map_ = MetricMap(
         found.final,

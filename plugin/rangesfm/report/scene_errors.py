@@ -18,13 +18,13 @@ _SHIFT = slice(3, 6)
 
 
 def errors_of_scene(
-    errors: MapErrors | None, summary: ResultSummary, path: Trajectory, anchor_ids: Sequence[str]
+    errors: MapErrors, summary: ResultSummary, path: Trajectory, anchor_ids: Sequence[str]
 ) -> dict[str, Any]:
     """Return how the centres of cameras and the anchors err together, cameras first; empty if it is not known.
 
     It is the same as in MapErrors, with as many modes as the shifts of these points need, and no more.
     """
-    if errors is None or not len(path) or summary.scale.interval_95 is None:
+    if not errors.are_known or not len(path) or summary.scale.interval_95 is None:
         return {}
     found = []
     points: tuple[tuple[Kind, Sequence[int | str], slice], ...] = (

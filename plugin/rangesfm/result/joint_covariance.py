@@ -11,7 +11,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.util.files.atomic import new_file
-from rangesfm.util.geometry.map_errors import Kind, MapErrors, PartErrors
+from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, Kind, MapErrors, PartErrors
 
 JOINT_COVARIANCE_NAME = "joint_covariance.npz"
 _KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -33,15 +33,15 @@ def write_map_errors(errors: MapErrors, folder: Path) -> None:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
-def read_map_errors(folder: Path) -> MapErrors | None:
-    """Read the file of a folder; None if it is not there.
+def read_map_errors(folder: Path) -> MapErrors:
+    """Read the file of a folder; without it, it is not known how the parts err.
 
     Raises:
         InputError: the file was not written by a run.
     """
     path = folder / JOINT_COVARIANCE_NAME
     if not path.is_file():
-        return None
+        return UNKNOWN_ERRORS
     parts: dict[Kind, PartErrors] = {}
     sizes: set[int] = set()
     try:

@@ -121,8 +121,8 @@ class ResultFolder:
         """Read one of ``RESULT_TABLES``; without its file it has no rows."""
         return table.read(self.path)
 
-    def read_map_errors(self) -> MapErrors | None:
-        """Read how the parts of the refined map err together; None if that is not known."""
+    def read_map_errors(self) -> MapErrors:
+        """Read how the parts of the refined map err together."""
         return read_map_errors(self.path)
 
     def read_reference(self) -> Reference:

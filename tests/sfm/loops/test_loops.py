@@ -84,7 +84,6 @@ def test_pairs_that_look_alike_in_two_aisles_are_contradicted_by_the_ranges() ->
     scaled = ScaledMap.of(survey.looped.survey, survey.looped.chain(), range_log(survey.looped.survey, 1))
     rest = scaled.refined()
     covariance = joint_errors(rest, 1.0)
-    assert covariance is not None
     finder = LoopFinder.in_refined_map(rest.problem.metric, scaled.trajectory, covariance, rest.pixel_stddev, seed=0)
     loops, contradicted = finder.tested(survey.alike)
     assert not loops

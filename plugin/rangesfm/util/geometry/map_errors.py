@@ -69,12 +69,17 @@ class MapErrors:
     rests on its diagonal.
 
     Attributes:
-        parts: by kind.
+        parts: by kind; empty where it is not known how they err.
         scale_stddev: standard deviation of the logarithm of the map's scale in this covariance.
     """
 
     parts: Mapping[Kind, PartErrors]
     scale_stddev: float
+
+    @property
+    def are_known(self) -> bool:
+        """Return whether it is known how the parts err."""
+        return len(self.parts) > 0
 
     def covariances(self, kind: Kind) -> Array:
         """Return the (k, d, d) covariance of each part of a kind; (0, 0, 0) without any."""
@@ -120,3 +125,6 @@ class MapErrors:
             covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
         covariance = covariance + by_mode @ by_mode.T
         return np.asarray(covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale))
+
+
+UNKNOWN_ERRORS = MapErrors({}, np.nan)
