@@ -78,7 +78,7 @@ class Halves:
             positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
         anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
         arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", "")
-        inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, Tape(), None, ())
+        inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, Tape())
         survey = Survey().changed({"scale.max_relative_stddev": 0.2})
         journal = Journal(Progress())
         return *join_models(SurveyRun(survey, inputs, journal), self.parts), journal.warnings

@@ -33,7 +33,7 @@ def run_of(looped: LoopedSurvey, folder: Path) -> SurveyRun:
     survey = looped.survey
     (site, _), log = local_site((), "unknown", ""), range_log(survey, 1, num_each=4)
     anchors = tuple(Anchor(name, position) for name, position in survey.anchors_m.items())
-    inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, Tape(), None, ())
+    inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, Tape())
     write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
     changes = {"output.path": folder, "mapper.matching": "sequential", "ranges.time_offset": 0.0}
     times = survey.model.timestamps_s

@@ -41,7 +41,7 @@ def run_stages(survey: MadeSurvey, seed: int, inputs: RangingInputs | None = Non
     settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
     if inputs is None:
         arms_m, site = survey.tag_in_cam_m[None], Site(np.zeros(3))
-        inputs = RangingInputs(survey.log, arms_m, survey.anchors, survey.anchor_frame, site, Tape(), None, ())
+        inputs = RangingInputs(survey.log, arms_m, survey.anchors, survey.anchor_frame, site, Tape())
     observations = associate(inputs.log, survey.trajectory, inputs.tag_in_cam_m, time_offset_s=survey.time_offset_s)
     path = PathOfModel("sparse/0", survey.model, survey.trajectory, observations)
     run = SurveyRun(settings, inputs, Journal(Progress()))

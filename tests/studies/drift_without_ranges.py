@@ -149,9 +149,7 @@ class Drifting:
     def run(self, positions: SurveyedPositions | None = None, tape: Tape | None = None) -> MetricResult:
         """Run all stages from the scale on, with all defaults."""
         known, no_arms = positions or SurveyedPositions(), np.zeros((0, 3))
-        inputs = RangingInputs(
-            NO_RANGES, no_arms, (), "unknown", Site(np.zeros(3)), tape or Tape(), None, (), positions=known
-        )
+        inputs = RangingInputs(NO_RANGES, no_arms, (), "unknown", Site(np.zeros(3)), tape or Tape(), positions=known)
         return run_stages(self.survey, self.seed, inputs)
 
 

@@ -193,7 +193,7 @@ class Known:
         given = (survey.log, survey.tag_in_cam_m[None], survey.anchors)
         log, arms_m, anchors = given if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)), ())
         frame, site = survey.anchor_frame, Site(np.zeros(3))
-        inputs = RangingInputs(log, arms_m, anchors, frame, site, Tape(), None, (), positions=surveyed)
+        inputs = RangingInputs(log, arms_m, anchors, frame, site, Tape(), positions=surveyed)
         return run_stages(survey, seed, inputs)
 
     def bound(self, pixel_stddev: float) -> tuple[float, float]:

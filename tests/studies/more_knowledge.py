@@ -78,7 +78,7 @@ class Measured:
             taped.append(TapedDistance((names[first], names[last]), float(length_m), LENGTH_STDDEV_M, CONTROL, 0))
         inputs = RangingInputs(
             observations.log, np.zeros((len(observations.log.tag_ids), 3)), tuple(case.anchors), case.frame,
-            Site(np.zeros(3)), Tape(tuple(taped)), None, (),
+            Site(np.zeros(3)), Tape(tuple(taped)),
             positions=SurveyedPositions(antenna=AntennaTrack(track, np.zeros(3), None, RangesOptions())),
         )  # fmt: skip
         return cls(name, path, inputs, PathOfModel("sparse/0", model_of_poses(path), path, observations))

@@ -50,9 +50,7 @@ SETTINGS = Survey().changed({"mapper.num_threads": 1})
 def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, ScaleUncertainty]:
     """Return the scale of the refined map, with all defaults."""
     known = SurveyedPositions(antenna=track)
-    inputs = RangingInputs(
-        NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), None, (), positions=known
-    )
+    inputs = RangingInputs(NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), positions=known)
     metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(Progress())), [survey_path], refine=True)
     return metric.estimate.value, metric.estimate.uncertainty
 

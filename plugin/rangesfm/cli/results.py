@@ -195,6 +195,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
     from rangesfm.measurements.positions.true_positions import read_true_positions
     from rangesfm.pipeline.ranges_for_models import ranges_of_survey
+    from rangesfm.util.geometry.reference import NO_REFERENCE
 
     if args.output_path is not None:
         require_apart(paths, Path(args.output_path))
@@ -211,7 +212,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
         tape = read_tape(survey.scale.distances)
         if survey.scale.markers is not None:
             tape = tape.with_more_markers(read_markers(survey.scale.markers))
-    reference = None if args.reference is None else read_true_positions(args.reference)
+    reference = NO_REFERENCE if args.reference is None else read_true_positions(args.reference)
     comparison = compare_many(models, ranges, tape, reference)
     lines = [str(comparison)]
     if args.output_path is not None:

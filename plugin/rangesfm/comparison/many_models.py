@@ -28,7 +28,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.text_tables import align_rows
-from rangesfm.util.geometry.reference import Reference
+from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
@@ -201,7 +201,7 @@ def compare_many(
     models: Sequence[NamedModel],
     ranges: ModelRanges | None = None,
     tape: Tape = Tape(),
-    reference: Reference | None = None,
+    reference: Reference = NO_REFERENCE,
 ) -> ModelsComparison:
     """Compare models with the first of them.
 
@@ -209,7 +209,7 @@ def compare_many(
         models: to compare.
         ranges: with which to compare the models; None: those of the first result folder among the models, if any.
         tape: taped distances to measure in each model.
-        reference: true positions; None for none.
+        reference: true positions.
 
     Raises:
         InputError: a model has no photo in common with the first, or lacks an end of a taped distance; or the reference
@@ -230,7 +230,7 @@ def compare_many(
             range_rms_m = _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
         rows.append(_row(models[0], model, range_rms_m))
     taped = _taped(models, ranges, onto_ranges, tape)
-    truth = [] if reference is None else [_truth_cells(model, reference) for model in models]
+    truth = [_truth_cells(model, reference) for model in models] if len(reference) else []
     return ModelsComparison(tuple(rows), lengths_along([model.path for model in models]), taped, truth)
 
 

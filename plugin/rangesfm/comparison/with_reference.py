@@ -12,7 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
 from rangesfm.result.comparison_row import ComparisonRow, rmse_heading
 from rangesfm.util.files.text_tables import align_rows
-from rangesfm.util.geometry.reference import Reference
+from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 from rangesfm.util.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import with_one_blas_thread
@@ -99,7 +99,7 @@ def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str) ->
     known, target, world_from_cam = known_keyframes(path, reference)
     positions = _in_frame(path, known, target, world_from_cam, frame)
     if positions is None:
-        return Reference(np.zeros((0, 3)), image_names=())
+        return NO_REFERENCE
     return Reference(positions, image_names=tuple(path.image_names[i] for i in known))
 
 

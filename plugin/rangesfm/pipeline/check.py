@@ -188,7 +188,7 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
         yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
-    if inputs.reference is not None:
+    if len(inputs.reference):
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
         yield f"reference: {len(inputs.reference)} positions{name}, only for comparison"
 

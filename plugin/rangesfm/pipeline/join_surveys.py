@@ -32,6 +32,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.files.atomic import require_apart, sole_writer
 from rangesfm.util.files.folders import real_path
+from rangesfm.util.geometry.reference import NO_REFERENCE
 from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
 
@@ -255,8 +256,8 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     site, anchors = local_site(anchors, frame, crs, survey.anchors.path)
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])
-    reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
-    inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, Tape(), reference, ())
+    reference = NO_REFERENCE if survey.report.reference is None else read_true_positions(survey.report.reference)
+    inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, Tape(), reference)
     as_joined = survey.changed(
         {
             "images.path": _images_path(finished),

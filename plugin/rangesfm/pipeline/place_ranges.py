@@ -58,7 +58,7 @@ def check_times(run: SurveyRun, path: Trajectory) -> None:
         InputError: the reference has none of the photos, or no range has a place on the path.
     """
     reference, offset_s = run.inputs.reference, run.survey.ranges.time_offset_s
-    if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
+    if len(reference) and not np.isfinite(reference.positions_at(path)[0]).any():
         why = reference.why_nothing_is_known("keyframes", reference.keys_of(path))
         raise InputError(why, run.survey.report.reference)
     if run.inputs.log.image_name is not None or offset_s is not None:

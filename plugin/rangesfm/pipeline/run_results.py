@@ -95,7 +95,8 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
 
 def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
     """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
-    if (reference := metric.inputs.reference) is None:
+    reference = metric.inputs.reference
+    if not len(reference):
         return ()
     frame, paths = metric.estimate.frame, {"scaled": metric.trajectory.as_in(metric.scaled)}
     if metric.kept is not None:

@@ -21,7 +21,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.util.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.util.files.folders import real_path
 from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.reference import Reference, read_reference
+from rangesfm.util.geometry.reference import NO_REFERENCE, Reference, read_reference
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 _Table = TypeVar("_Table", bound=TableFile)
@@ -128,7 +128,7 @@ class ResultFolder:
     def read_reference(self) -> Reference:
         """Read the reference positions of the photos, in the world of the metric models; empty if there are none."""
         path = self.path / REFERENCE_NAME
-        return read_reference(path) if path.is_file() else Reference(np.zeros((0, 3)), image_names=())
+        return read_reference(path) if path.is_file() else NO_REFERENCE
 
     def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
         """Read the model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""

@@ -32,7 +32,7 @@ from rangesfm.sfm.exif_positions import read_exif_positions
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.folders import natural_order
-from rangesfm.util.geometry.reference import Reference
+from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
 # of these numbers, the anchors are in that unit.
@@ -56,7 +56,7 @@ class RangingInputs:
         anchor_frame: "site", "first_camera" or "unknown".
         site: frame of the anchors' positions.
         tape: taped distances; empty if not given.
-        reference: true positions; None if not given.
+        reference: true positions; empty if not given.
         assumed: lines about how the files were read.
         positions: known positions of marks, in the frame of the anchors.
         imu: inertial sensor on the camera; None without one.
@@ -68,8 +68,8 @@ class RangingInputs:
     anchor_frame: str
     site: Site
     tape: Tape
-    reference: Reference | None
-    notes: tuple[str, ...]
+    reference: Reference = NO_REFERENCE
+    notes: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
     imu: InertialSensor | None = None
@@ -142,7 +142,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     if curve_path is not None:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances).with_more_markers(markers)
-    reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
+    reference = NO_REFERENCE if survey.report.reference is None else read_true_positions(survey.report.reference)
     imu = read_sensor(survey.imu)
     notes = (*_warnings(log, anchors, survey), *curve_notes, *(() if imu is None else imu.log.doubts))
     assumed = (
@@ -152,7 +152,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         *anchor_notes,
         *positions.notes,
         *tape.notes,
-        *(() if reference is None else reference.notes),
+        *reference.notes,
         *(() if imu is None else imu.log.notes),
     )
     log = log.in_time_order()

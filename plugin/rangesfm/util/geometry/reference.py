@@ -143,6 +143,9 @@ class Reference:
         return _rows(self.positions_m, index), rotations
 
 
+NO_REFERENCE = Reference(np.zeros((0, 3)), image_names=())
+
+
 def is_reference_file(head: str) -> bool:
     """Return whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
     names = header_names(head)
