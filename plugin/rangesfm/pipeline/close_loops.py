@@ -85,7 +85,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
         )
         before, after = metric.kept, last.metric.refined
         assert after is not None, "a refined map"
-        path = metric.trajectory.as_in(before.model) if closed else None
+        path = metric.trajectory.as_in(before.model)
         loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path)
         run.journal.warn(*filter(None, [loops.warning]))
         # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.

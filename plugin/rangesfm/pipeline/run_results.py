@@ -100,7 +100,7 @@ def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]
         return ()
     frame, paths = metric.estimate.frame, {"scaled": metric.trajectory.as_in(metric.scaled)}
     if metric.kept is not None:
-        if metric.kept.loops is not None and metric.kept.loops.before is not None:
+        if metric.kept.loops is not None and metric.kept.loops.closed:
             paths["refined, loops open"] = metric.kept.loops.before
         paths["refined"] = metric.trajectory.as_in(metric.final)
     rows = papers_table(paths, reference, frame=frame)

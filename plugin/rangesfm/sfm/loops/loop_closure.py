@@ -23,18 +23,18 @@ class LoopClosure:
         num_verified: pairs of these that match.
         closed: pairs of these that were used.
         contradicted: pairs of these that the measurements contradict.
-        before: keyframes of the map that would be the result with its loops open, metres; None if none was closed.
+        before: keyframes of the map that would be the result with its loops open, metres.
     """
 
     num_proposed: int
     num_verified: int
     closed: tuple[NamedPair, ...]
     contradicted: tuple[NamedPair, ...]
-    before: Trajectory | None
+    before: Trajectory
 
     def moved_m(self, after: Trajectory) -> float:
         """Return the root mean square movement of the keyframes, whose path is now ``after``."""
-        return 0.0 if self.before is None else rmse(after.centers - self.before.centers)
+        return rmse(after.centers - self.before.centers)
 
     @property
     def warning(self) -> str | None:
@@ -49,4 +49,4 @@ class LoopClosure:
 
     def moved(self, offset_m: Array) -> LoopClosure:
         """Return the same in a world whose coordinates are larger by ``offset_m`` (3,)."""
-        return replace(self, before=self.before and self.before.transformed(1.0, np.eye(3), offset_m))
+        return replace(self, before=self.before.transformed(1.0, np.eye(3), offset_m))
