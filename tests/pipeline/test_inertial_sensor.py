@@ -65,10 +65,16 @@ def half_width(result: dict[str, Any]) -> float:
     return float(np.log(high / low) / 2)
 
 
-def test_photos_and_a_sensor_make_a_metric_and_level_map(
-    survey: Path, tmp_path: Path, rangesfm_command: Command
-) -> None:
-    result = scaled(survey, tmp_path / "out", rangesfm_command, *SENSOR)
+@pytest.fixture(scope="module")
+def alone(survey: Path, tmp_path_factory: pytest.TempPathFactory, rangesfm_command: Command) -> Path:
+    """The output folder of the survey with its sensor alone."""
+    out = tmp_path_factory.mktemp("alone") / "out"
+    scaled(survey, out, rangesfm_command, *SENSOR)
+    return out
+
+
+def test_photos_and_a_sensor_make_a_metric_and_level_map(alone: Path) -> None:
+    result = json.loads((alone / "result.json").read_text())
     assert (result["scale"]["verdict"], result["scale"]["method"]) == ("good", "imu")
     low, high = result["scale"]["interval_95"]
     assert low < METRES_PER_UNIT < high
@@ -80,17 +86,20 @@ def test_photos_and_a_sensor_make_a_metric_and_level_map(
     down = np.array(imu["gravity_in_world"]) / np.linalg.norm(imu["gravity_in_world"])
     assert np.degrees(np.arccos(-down @ up)) < 0.5
     assert imu["up_stddev_deg"] < 0.5
-    again = expect(plan_of_result(tmp_path / "out"))  # its map bends as usual, which is more than this one
+    again = expect(plan_of_result(alone))  # its map bends as usual, which is more than this one
     assert half_width(result) < again.uncertainty.half_width_95 < 3 * half_width(result)
-    assert "samples of an inertial sensor give it metres" in (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "samples of an inertial sensor give it metres" in (alone / "report.html").read_text("utf-8")
 
 
-def test_beside_ranges_it_makes_the_interval_narrower(survey: Path, tmp_path: Path, rangesfm_command: Command) -> None:
-    alone, by_ranges, both = (
+def test_beside_ranges_it_makes_the_interval_narrower(
+    survey: Path, alone: Path, tmp_path: Path, rangesfm_command: Command
+) -> None:
+    by_ranges, both = (
         scaled(survey, tmp_path / str(k), rangesfm_command, *flags)
-        for k, flags in enumerate([SENSOR, RANGES, (*SENSOR, *RANGES)])
+        for k, flags in enumerate([RANGES, (*SENSOR, *RANGES)])
     )
-    assert half_width(both) < min(half_width(by_ranges), half_width(alone))
+    by_sensor = json.loads((alone / "result.json").read_text())
+    assert half_width(both) < min(half_width(by_ranges), half_width(by_sensor))
     low, high = both["scale"]["interval_95"]
     assert low < METRES_PER_UNIT < high
     assert {*both["scale"]["by_kind"]} == {"ranges", "imu"}

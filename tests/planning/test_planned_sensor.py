@@ -63,7 +63,7 @@ def test_a_level_camera_leaves_scale_factors_open_and_tilting_it_gains_what_the_
 
 
 def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> None:
-    survey = planned(FIVE_ANCHORS_M[:3], "site")
+    survey = planned(FIVE_ANCHORS_M[:3], "site", loop(40.0, 50))
     before = plan_survey(survey)
     advised = next(advice for advice in before.advice_for_scale if advice.kind == "inertial sensor")
     plan = plan_survey(replace(survey, sensor=PlannedSensor()))

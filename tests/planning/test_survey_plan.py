@@ -51,17 +51,22 @@ def test_advice_is_ranked_by_its_gain_and_each_thing_is_advised_once(plan: Surve
         assert len({(advice.kind, advice.subject) for advice in ranking}) == len(ranking)
 
 
-def test_with_all_anchors_at_a_rovers_height_the_first_advice_is_to_raise_one() -> None:
+@pytest.fixture(scope="module")
+def level_plan() -> SurveyPlan:
+    """A plan whose anchors are all at the height of a rover's path."""
     path = loop(height_amplitude_m=0.0)
     level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
-    plan = plan_survey(planned(COPLANAR_M, "site", level, path_is_level=True))
-    assert plan.place is not None
-    assert np.isinf(plan.place.stddev_m[2])
-    first = plan.advice_for_place[0]
+    return plan_survey(planned(COPLANAR_M, "site", level, path_is_level=True))
+
+
+def test_with_all_anchors_at_a_rovers_height_the_first_advice_is_to_raise_one(level_plan: SurveyPlan) -> None:
+    assert level_plan.place is not None
+    assert np.isinf(level_plan.place.stddev_m[2])
+    first = level_plan.advice_for_place[0]
     assert first.kind == "anchor height"
     assert first.words.startswith("raise anchor")
     assert first.place_stddev_m < 2.0
-    assert any("z open" in line for line in plan.lines)
+    assert any("z open" in line for line in level_plan.lines)
 
 
 def test_anchors_stay_within_the_heights_that_are_allowed() -> None:
@@ -103,14 +108,11 @@ def test_ten_times_the_ranges_average_out_their_noise_and_hardly_anything_else()
     assert 0.8 * few.uncertainty.empirical < many.uncertainty.empirical < 1.05 * few.uncertainty.empirical
 
 
-def test_plan_json_holds_it_all_and_what_is_open_is_null(tmp_path: Path) -> None:
-    path = loop(height_amplitude_m=0.0)
-    level = replace(path, centers=path.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.6])
-    plan = plan_survey(planned(COPLANAR_M, "site", level))
-    content = json.loads(write_plan(plan, tmp_path / "plan")[0].read_text())
-    assert content["scale_stddev"] == plan.scale_stddev
+def test_plan_json_holds_it_all_and_what_is_open_is_null(level_plan: SurveyPlan, tmp_path: Path) -> None:
+    content = json.loads(write_plan(level_plan, tmp_path / "plan")[0].read_text())
+    assert content["scale_stddev"] == level_plan.scale_stddev
     assert content["place"]["stddev_m"][2] is None
-    assert len(content["advice_for_place"]) == len(plan.advice_for_place)
+    assert len(content["advice_for_place"]) == len(level_plan.advice_for_place)
 
 
 def test_a_survey_with_unknown_anchors_has_no_place() -> None:

@@ -24,9 +24,10 @@ def turned(rotation: Array) -> float:
     return float(np.linalg.norm(Rotation.from_matrix(rotation).as_rotvec()))
 
 
-def test_offset_rotation_and_bias_are_found_within_their_errors() -> None:
+@pytest.mark.parametrize("num_seeds", [4, 12])
+def test_offset_rotation_and_bias_are_found_within_their_errors(num_seeds: int) -> None:
     errors = []
-    for seed in range(12):
+    for seed in range(num_seeds):
         motion = by_hand(seed)
         found = align_imu(imu_log(motion, offset_s=OFFSET_S, seed=seed), photos(motion))
         assert not found.mistakes
