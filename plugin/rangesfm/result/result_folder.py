@@ -141,7 +141,8 @@ class ResultFolder:
         Raises:
             InputError: the result has photo times, but none for a photo of the model.
         """
-        path = trajectory_from_reconstruction(model, self.timestamps_s or None)
+        has_table = (self.path / PhotoTimes.NAME).is_file()  # which a result without times does not have
+        path = trajectory_from_reconstruction(model, self.timestamps_s if has_table else None)
         if not len(path) and model.num_reg_images():
             raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", self.path)
         return path
