@@ -73,12 +73,13 @@ def blas_kernels() -> list[str]:
 # Test files that take seven seconds or more, the longest first, by the sums of ``pytest --durations=0``, and then those
 # of which the slow tests take 15 seconds or more.
 LONG_FILES = """
-    test_commands test_initialize test_mistakes test_trilateration test_with_ranges test_reconstruct test_pages
-    test_report_page test_bad_input test_time_offset test_same_results test_cpp_part test_view test_surroundings
-    test_report test_broken_refinement test_run test_join_models test_survey_plan test_positions_alone
-    test_external_mapping test_close_loops test_site_anchors test_same_everywhere test_measure test_rigs
-    test_scale_verdict test_learned test_anchor_sides test_main test_uncertainty test_drifting_maps test_kernels
-    test_kills test_batch test_numbers test_workflows
+    test_cpp_part test_inertial_sensor test_commands test_surroundings test_initialize test_report_page
+    test_same_everywhere test_view test_inertial_scale test_alignment test_poses_alone test_same_results
+    test_planned_sensor test_bad_input test_imu test_run test_with_ranges test_reconstruct test_pages test_time_offset
+    test_trilateration test_survey_plan test_positions_alone test_external_mapping test_loose_pieces test_join_models
+    test_drifting_maps test_mistakes test_close_loops test_site_anchors test_measure test_rigs test_scale_verdict
+    test_learned test_anchor_sides test_main test_uncertainty test_broken_refinement test_kernels test_kills test_batch
+    test_numbers test_workflows
 """
 # Tests that take seconds and are left out unless they are asked for: see the head of ``slow_tests.txt``.
 SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"

@@ -44,13 +44,13 @@ def make_shared_result() -> MakeResult:
 def write_result(
     folder: Path,
     *,
-    num_keyframes: int = 160,
-    num_ranges_per_anchor: int = 350,
+    num_keyframes: int = 60,
+    num_ranges_per_anchor: int = 120,
     anchor_ids: tuple[str, ...] = ("1", "2", "3", "4", "5", "6", "7", "8"),
     is_refined: bool = True,
     has_reference: bool = True,
     has_photos: bool = False,
-    num_points: int = 9000,
+    num_points: int = 2000,
     offset_m: tuple[float, float, float] | Array = (0.0, 0.0, 0.0),
     changes: dict[str, Any] | None = None,
 ) -> Path:
@@ -126,7 +126,7 @@ def _wander(rng: np.random.Generator, num: int) -> Array:
     return np.asarray(smooth / smooth.std())
 
 
-def _room(rng: np.random.Generator, num: int = 9000) -> Array:
+def _room(rng: np.random.Generator, num: int) -> Array:
     points = rng.uniform((-2.4, -2.9, 0.0), (2.4, 2.9, 2.3), size=(num, 3))
     wall = rng.integers(0, 5, num)
     for index, (axis, value) in enumerate([(0, -2.4), (0, 2.4), (1, -2.9), (1, 2.9), (2, 0.0)]):
