@@ -9,15 +9,21 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, by_walk, imu_log, photos
+from tests.simulated.model import synthetic_model
+from tests.simulated.surveys import adjusted
 
 from rangesfm.demo.simulated_imu import PHONE
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.photo_bending import bending_of_model
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import Mounting
 from rangesfm.measurements.imu.sensor_prior import SensorPrior
+from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.similarity import IDENTITY, align_points
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 METRES_PER_UNIT = 1 / 0.37
@@ -67,6 +73,29 @@ def test_errors_of_photos_on_an_even_walk_do_not_make_the_map_smaller() -> None:
     assert abs(off.mean()) < 0.05
     assert np.abs(off / stddev).max() < 3
     assert np.sqrt(np.mean(np.square(off / stddev))) < 1.7
+
+
+def test_the_sensor_corrects_the_shape_of_a_map_by_bad_photos_and_not_only_its_scale() -> None:
+    for seed in (9, 10):
+        motion, times_s = by_hand(seed), np.arange(2.0, 58.0, 0.7)
+        turns = motion.world_from_imu(times_s).as_matrix() @ CAM_FROM_IMU.T
+        made = synthetic_model(
+            *(times_s, motion.places_m(times_s), turns),
+            num_observations=60,
+            max_track_length=8,
+            depth_range_m=(1.5, 6.0),
+            pixel_stddev=2.0,
+            metric_from_sfm=IDENTITY,
+            seed=seed,
+        )
+        model = adjusted(made.reconstruction)
+        path = trajectory_from_reconstruction(model, made.timestamps_s)
+        bending = bending_of_model(model, path, CameraOptions(refine_intrinsics=False), RefineOptions(), 1)
+        log = imu_log(motion, grade=PHONE, seed=seed)
+        found = scale_by_sensor(InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, bending)).alone
+        off = np.log(found.scale.value / align_points(path.centers, made.centers_m).scale)
+        assert abs(off) < 0.008
+        assert found.posterior.uncertainty.half_width_95 < 0.01
 
 
 def test_the_interval_of_a_rover_that_hardly_turns_or_accelerates_is_wide() -> None:

@@ -2,13 +2,14 @@
 
 What is measured between two photos is a linear function of velocities, of few numbers that all intervals share, and of
 the poses. In stretches of neighbouring photos the velocities are eliminated exactly, and what is left is turned (QR)
-into as many numbers as are shared. These lose nothing of what the log says of the shared numbers where errors are as
-assumed there, and are linear combinations of all measurements where they are not.
+into as many numbers as are shared, and into others that tell how the map is bent. The former lose nothing of what the
+log says of the shared numbers where the errors of a stretch are independent of those of others. Errors of a bent map
+are not, and without the latter it would keep the shape by its photos alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -331,15 +332,19 @@ class LinearMotion:
         Args:
             max_num: largest number of combinations, if one stretch has no more; the stretches are evenly chosen.
         """
-        stretches, num = self.stretches(sizes), len(self.intervals)
-        most = max(max_num // max(len(each.free) for each in stretches), 1)
+        stretches = self.stretches(sizes)
+        most = max(max_num // max(len(each.combination) + len(each.bends) for each in stretches), 1)
         chosen = np.unique(np.linspace(0, len(stretches) - 1, most).round().astype(np.int64)).tolist()
-        parts = []
-        for each in (stretches[number] for number in chosen):
-            found = np.zeros((len(each.free), num, 9))
-            found[:, each.rows] = each.free.reshape(-1, len(each.rows), 9)
-            parts.append(found)
-        return self._level(np.concatenate(parts))
+        parts = [(each, rows) for each in (stretches[k] for k in chosen) for rows in (each.combination, each.bends)]
+        return self._level(self._of_all(parts))
+
+    def _of_all(self, parts: Iterable[tuple[Stretch, Array]]) -> Array:
+        """Return the (c, k, 9) coefficients of (..., 9 m) combinations of stretches, in this order."""
+        found = []
+        for stretch, rows in parts:
+            found.append(np.zeros((len(rows), len(self.intervals), 9)))
+            found[-1][:, stretch.rows] = rows.reshape(-1, len(stretch.rows), 9)
+        return np.concatenate(found)
 
     def _level(self, coefficients: Array) -> Combinations:
         """Return those (c, k, 9) combinations of combinations that do not depend on gravity's direction."""
@@ -348,22 +353,25 @@ class LinearMotion:
         return Combinations(np.tensordot(seen[:, 2:].T, coefficients, axes=1), self)
 
     def combined(self, sizes: Sizes, max_num: int, *, keeps_direction: bool) -> Combinations:
-        """Return the few combinations of all errors that tell what all intervals share.
+        """Return the few combinations of all errors that tell what all intervals share, and how the map is bent.
 
         Args:
-            max_num: about the largest number of combinations; those that tell as much as all are never fewer.
+            max_num: about the largest number of combinations; those that tell what is shared are never fewer. Of the
+                others, those that tell most of the bending are chosen.
             keeps_direction: whether they depend on gravity's direction; otherwise what does is left out.
         """
-        stretches, num = self.stretches(sizes), len(self.intervals)
-        parts = []
+        stretches, parts = self.stretches(sizes), []
         for group in np.array_split(np.arange(len(stretches)), min(max(max_num // NUM_SHARED, 1), len(stretches))):
             of_group = [stretches[number] for number in group]
             basis = np.linalg.qr(np.vstack([each.combination @ each.shared for each in of_group]))[0]
-            ends = np.cumsum([0, *(len(each.combination) for each in of_group)])
-            found = np.zeros((basis.shape[1], num, 9))
-            for each, first, last in zip(of_group, ends[:-1], ends[1:], strict=True):
-                found[:, each.rows] = (basis[first:last].T @ each.combination).reshape(-1, len(each.rows), 9)
+            own = block_diag(*(each.combination for each in of_group))
+            found = np.zeros((basis.shape[1], len(self.intervals), 9))
+            found[:, np.concatenate([each.rows for each in of_group])] = (basis.T @ own).reshape(basis.shape[1], -1, 9)
             parts.append(found)
+        shares = np.sort(np.concatenate([each.bend_shares for each in stretches]))[::-1]
+        num_left = max_num - sum(len(each) for each in parts)
+        least = max([UNDETERMINED, *shares[max(num_left, 0) :][:1]])
+        parts.append(self._of_all((each, each.bends[each.bend_shares > least]) for each in stretches))
         coefficients = np.concatenate(parts)
         return Combinations(coefficients, self) if keeps_direction else self._level(coefficients)
 
@@ -416,7 +424,9 @@ class Stretch:
         by_velocity: (9 m, 3 q). of_places: (3 q, 9 m) covariance of the errors of photos' places with these errors.
         strength_of_errors: expected square of what errors of the most likely places would add to the derivative by the
             scale, in standard deviations of the errors, without what velocities explain.
-        combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1.
+        combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1, by which the errors
+            depend on what is shared. bends: (b, 9 m) all others. bend_shares: (b,) parts of their variances that are
+            due to the bending of the map, on which they depend one by one.
     """
 
     rows: Indices
@@ -431,6 +441,8 @@ class Stretch:
     of_places: Array
     strength_of_errors: float
     combination: Array
+    bends: Array
+    bend_shares: Array
 
     @classmethod
     def of(cls, rows: Indices, motion: LinearMotion, sizes: Sizes) -> Stretch:
@@ -446,8 +458,8 @@ class Stretch:
 
         by_pose = of_photos(motion.errors.by_pose[rows])
         late, places = of_photos(sizes["photo_times"] * motion.late[rows]), np.tile(np.arange(6) >= 3, len(photos))
-        of_poses = motion.problem.bent_poses(photos, motion.state.scale)
-        of_poses += np.diag(np.where(places, sizes["pose_places"], sizes["pose_turns"]) ** 2)
+        bent = motion.problem.bent_poses(photos, motion.state.scale)
+        of_poses = bent + np.diag(np.where(places, sizes["pose_places"], sizes["pose_turns"]) ** 2)
         total = by_pose @ of_poses @ by_pose.T + late @ late.T
         blocks = total.reshape(num, 9, num, 9)  # a view
         densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
@@ -461,7 +473,11 @@ class Stretch:
         left = left / np.maximum(np.linalg.norm(left, axis=0), 1e-300)
         turned, strengths, _ = np.linalg.svd(left - basis @ (basis.T @ left), full_matrices=False)
         turned = turned[:, strengths > UNDETERMINED]
-        combination = solve_triangular(lower, turned, lower=True, trans=1).T
+        others = np.linalg.qr(np.hstack([basis, turned]), mode="complete")[0][:, basis.shape[1] + turned.shape[1] :]
+        effects = others.T @ solve_triangular(lower, by_pose, lower=True)
+        bend_shares, bends = np.linalg.eigh(effects @ bent @ effects.T)
+        turned_back = solve_triangular(lower, np.hstack([turned, others @ bends]), lower=True, trans=1).T
+        combination, bends = np.split(turned_back, [turned.shape[1]])
         # Places err by those of the poses, and where the camera was at another time.
         moved = block_diag(*(sizes["photo_times"] * motion.rates[photos, 3:, None]))
         of_places = of_poses[places] @ by_pose.T + moved @ late.T
@@ -471,7 +487,8 @@ class Stretch:
         strength = float(np.einsum("ia,ab,ib->", effects, left_m2, effects, optimize=True))
         residual, grown = motion.errors.residual[rows].ravel(), motion.grown[rows].ravel()
         return cls(
-            *(rows, before, after, photos, residual, grown, own, lower, by_velocity, of_places, strength, combination)
+            *(rows, before, after, photos, residual, grown, own, lower, by_velocity, of_places, strength),
+            *(combination, bends, bend_shares),
         )
 
     def _left(self, step: Array) -> Array:
@@ -482,13 +499,6 @@ class Stretch:
         whitened = solve_triangular(self.lower, np.column_stack([self.by_velocity, self._left(step)]), lower=True)
         basis, upper = np.linalg.qr(whitened[:, :-1])
         return -np.asarray(solve_triangular(upper, basis.T @ whitened[:, -1])).reshape(-1, 3)
-
-    @property
-    def free(self) -> Array:
-        """(r, 9 m) all combinations that do not depend on velocities, with a covariance of 1."""
-        num = self.by_velocity.shape[1]
-        basis = np.linalg.qr(solve_triangular(self.lower, self.by_velocity, lower=True), mode="complete")[0]
-        return np.asarray(solve_triangular(self.lower, basis[:, num:], lower=True, trans=1).T)
 
     def place_errors_m(self, step: Array) -> Array:
         """Return the (m, 2, 3) most likely errors of the places of the photos before and after each interval."""
