@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
@@ -71,11 +71,10 @@ def diagnose_points(
         errors: of the refined map; where they are not known: those of ``placed``.
         scale_stddev: as for ``MapErrors.joint``.
     """
-    is_seen = marks_seen(points, model)
-    tested = [of for of, seen in zip(points.points, is_seen, strict=True) if seen and of.kind in (CONTROL, CHECK)]
+    named = NamedPoints.in_model(model, points.markers)
+    tested = [of for of in points.points if named.is_shown(of.name) and of.kind in (CONTROL, CHECK)]
     if not tested:
         return MistakeTests()
-    named = NamedPoints.in_model(model, points.markers)
     found = [named.find_mark(of.name) for of in tested]
     of_map = errors.joint(found, scale_stddev) if errors.are_known else placed.joint(found)
     if errors.are_known and placed.by_antenna:  # the errors of the refined map have none that last

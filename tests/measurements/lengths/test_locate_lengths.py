@@ -14,7 +14,7 @@ from tests.simulated.path import loop_path
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.locate_lengths import locatable, locate_distances
 from rangesfm.measurements.lengths.tape import Marker, Tape, TapedDistance
-from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.pipeline.result_records import disagreements
 from rangesfm.result.entries import DistanceRow
 
@@ -103,9 +103,9 @@ def test_marks_that_do_not_meet_are_left_out_of_poses_that_drift(made: Synthetic
     given = tape(taped(name, "wall"), taped(name, "door"), wall=wall, door=astray)
     assert locatable(given, with_points).distances == given.distances
     assert locatable(given, poses).distances == given.distances[:1]
-    known = tuple(ControlPoint(marker, np.zeros(3), 0.01, "control", 2) for marker in ("wall", "door"))
-    assert marks_seen(ControlPoints(known, given.markers), with_points).tolist() == [True, True]
-    assert marks_seen(ControlPoints(known, given.markers), poses).tolist() == [True, False]
+    for model, is_door_shown in ((with_points, True), (poses, False)):
+        points = NamedPoints.in_model(model, given.markers)
+        assert [points.is_shown(marker) for marker in ("wall", "door")] == [True, is_door_shown]
 
 
 def test_a_distance_off_by_more_than_tape_and_scale_explain_is_named() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array, vstack
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.tape import CONTROL, Marker
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
@@ -77,23 +77,18 @@ class ControlPoints:
         return replace(self, points=tuple(points))
 
 
-def marks_seen(points: ControlPoints, model: pycolmap.Reconstruction) -> Mask:
-    """Return which points (k,) are shown by their marks, as of ``NamedPoints.is_shown``."""
-    named = NamedPoints.in_model(model, points.markers)
-    return np.array([named.is_shown(point.name) for point in points.points], dtype=bool)
-
-
 def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
-    """Find the marks of control and check points in a model; points that are not shown are left out.
+    """Find the marks of control and check points in a model, which must show them as of ``NamedPoints.is_shown``.
 
     Args:
-        points: in the site. model: in any world. path: of its keyframes, in the same world.
+        points: in the site; those that the model does not show are left out.
+        model: in any world. path: of its keyframes, in the same world.
 
     Raises:
         InputError: the marks of a point are not of one point, or are seen from one direction only.
     """
-    seen = [point for point, is_seen in zip(points.points, marks_seen(points, model), strict=True) if is_seen]
-    named, k = NamedPoints.in_model(model, points.markers, first_ids=path.frame_ids), len(seen)
+    named = NamedPoints.in_model(model, points.markers, first_ids=path.frame_ids)
+    k = len(seen := [point for point in points.points if named.is_shown(point.name)])
     found = [named.find_mark(point.name) for point in seen]
     by_pose = [named.by_pose(each, len(path)) for each in found]
     stddev_m = np.array([point.stddev_m for point in seen])

@@ -11,9 +11,10 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.clock import find_antenna_offset
-from rangesfm.measurements.positions.control_points import ControlPoints, locate_points, marks_seen
+from rangesfm.measurements.positions.control_points import ControlPoints, locate_points
 from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -108,8 +109,8 @@ class SurveyedPositions:
 
     def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
         """Yield a line for the user about points that a model does not show."""
-        points, is_seen = self.points.points, marks_seen(self.points, model)
-        if unseen := [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]:
+        points, named = self.points.points, NamedPoints.in_model(model, self.points.markers)
+        if unseen := [point.name for point in points if not named.is_shown(point.name)]:
             marked = (
                 ""
                 if self.points.markers.keys() & {*unseen}
