@@ -38,8 +38,8 @@ def doubts_of_ranges(
 def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
     """Return the faults of the path and of the anchors."""
     problem, half_width = solution.problem, uncertainty.half_width_95
-    kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
-    is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
+    kind = path_kind(problem.centers)
+    is_round = kind in ("circular", "spherical") and not problem.has_known_anchors
     # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
     if half_width > DOUBTFUL_ABOVE and is_round:
         yield Doubt(*WHY_SCALE_IS_OPEN[kind])

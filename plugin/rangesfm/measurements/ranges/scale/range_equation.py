@@ -77,6 +77,11 @@ class RangeProblem:
     def num_anchors(self) -> int:
         return len(self.anchor_stddev_m)
 
+    @property
+    def has_known_anchors(self) -> bool:
+        """Whether any anchor with ranges has a given position."""
+        return bool(np.isfinite(self.anchor_stddev_m[self.anchor_index]).any())
+
     def carried(self, on_path: OnPath, turns: Array, shifts: Array) -> RangeProblem:
         """Return the ranges on a path that was bent.
 

@@ -237,7 +237,7 @@ class RangeScale(KindOnMap):
     def remarks(self, on_map: JointMap) -> Iterator[Doubt]:
         """Yield what is not determined, and that the anchors' coordinates widen the interval."""
         yield from remarks_on_anchors(self.solution, self.told.anchors)
-        if np.isfinite(self.posed.ranges.anchor_stddev_m).any():
+        if self.posed.ranges.has_known_anchors:
             posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
             unknown = replace(self, posed=posed, solution=solution)
             others = [unknown if each is self else each for each in on_map.kinds]
@@ -262,5 +262,4 @@ def _ranges_alone(problem: RangeProblem) -> RangeProblem:
     distances = problem.distances.subset(~problem.distances.is_between_points)
     if problem.placement is None:
         return replace(problem, distances=distances)
-    is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
-    return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)
+    return replace(problem, distances=distances, placement=None, frame_is_free=problem.has_known_anchors)

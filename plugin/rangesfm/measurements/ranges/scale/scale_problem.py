@@ -70,7 +70,6 @@ class ScaleProblem:
         ranges: the problem; its model world is the first camera's frame, unscaled.
         errors: prior errors of its ranges, before anything is estimated.
         rows: (k,) rows of the observations that its ranges are.
-        anchors_are_known: whether given anchor positions are used.
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
     """
@@ -79,7 +78,6 @@ class ScaleProblem:
     ranges: RangeProblem
     errors: RangeErrors
     rows: Indices
-    anchors_are_known: bool
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
 
@@ -212,7 +210,7 @@ def scale_problem(
         gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,
     )
-    return ScaleProblem(given, ranges, errors, rows, bool(known.any()), tuple(notes), left_out)
+    return ScaleProblem(given, ranges, errors, rows, tuple(notes), left_out)
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:

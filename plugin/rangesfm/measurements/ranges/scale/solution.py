@@ -99,9 +99,9 @@ def solve_scale(posed: ScaleProblem) -> Solution:
         start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
         return solution_from(posed, complete_unknown_anchors(problem, start))
     camera_side = posed.given.camera_side if problem.frame_is_free else None
-    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, posed.given.seed), camera_side)
+    fits = on_side(problem, _distinct_fits(problem, posed.given.seed), camera_side)
     starts = [fit.state for fit in fits]
-    if posed.anchors_are_known and not problem.frame_is_free:
+    if problem.has_known_anchors and not problem.frame_is_free:
         starts += _consensus_states(problem)
     starts.sort(key=lambda state: _unlikeliness(problem, errors, state))
     likeliest = each_once(starts, lambda *both: _are_same(problem, *both), _NUM_ALTERNATIVES)
@@ -128,12 +128,12 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
     return starts
 
 
-def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
+def _distinct_fits(problem: RangeProblem, seed: int) -> list[RangeFit]:
     """Return the local minima, best first, each different map once.
 
     They are searched with few ranges per anchor and ranked with more.
     """
-    small = spread_subset(problem, ENOUGH_TO_SEARCH)
+    small, anchors_are_known = spread_subset(problem, ENOUGH_TO_SEARCH), problem.has_known_anchors
     if not anchors_are_known:
         starts = unknown_anchor_starts(problem)
     else:
