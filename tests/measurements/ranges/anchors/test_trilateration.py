@@ -92,6 +92,15 @@ class TestOutliers:
         assert np.all(found.weights[is_outlier[order]] < 0.1)
         assert found.noise_stddev_m == pytest.approx(0.05, rel=0.4)
 
+    def test_that_read_short_are_found_though_short_ranges_err(self) -> None:
+        positions, rng = flight(), np.random.default_rng(0)
+        is_outlier = rng.permutation(100) < 40
+        ranges = distances(positions) + noise(100, 0.05)
+        found = trilaterate(positions, np.where(is_outlier, ranges * rng.uniform(0.02, 0.5, 100), ranges))
+        assert np.all(found.weights[is_outlier] < 0.1)
+        assert found.position_stddev_m < 0.3
+        assert squared_error(found) < chi2.ppf(0.999, 3)
+
 
 class TestPositionsInAPlane:
     def test_give_both_places(self) -> None:

@@ -24,7 +24,6 @@ from rangesfm.measurements.ranges.anchors.point_fit import (
     judged_fits,
     known_directions,
 )
-from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, cost_at, solve
 from rangesfm.util.geometry.numerics import UNDETERMINED
@@ -194,7 +193,7 @@ def trilaterate_anchors(
     counts = np.bincount(log.anchor_index[rows], minlength=num)
     rows = rows[np.argsort(log.anchor_index[rows], kind="stable")]
     rows = rows[counts[log.anchor_index[rows]] >= MIN_NUM_RANGES]
-    index, shared_m, given_m = log.anchor_index[rows], shared_stddev(log)[rows], log.range_stddev_m[rows]
+    index, given_m = log.anchor_index[rows], log.range_stddev_m[rows]
     tags_m, found = tag_positions_m[rows], dict[int, JudgedFit]()
     middle = tags_m.mean(axis=0) if len(rows) else np.zeros(3)
     heights_m = np.array([height_m.get(anchor_id, np.nan) for anchor_id in log.anchor_ids])
@@ -214,11 +213,16 @@ def trilaterate_anchors(
     )
     if len(rows):
         given_m = np.where(np.isfinite(given_m), given_m, options.range_stddev_m or np.nan)
+        curve_m = None if log.shared_stddev_m is None else log.shared_stddev_m[rows]
         heard = np.unique(index)
-        fits = [fit_with_own_noise(problem.of_anchor(k), shared_m[index == k], given_m[index == k]) for k in heard]
+        fits = [
+            fit_with_own_noise(
+                problem.of_anchor(k), None if curve_m is None else curve_m[index == k], given_m[index == k]
+            )
+            for k in heard
+        ]
         by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if log.timestamp_s is None else []
         times_s = np.concatenate(by_walk) if log.timestamp_s is None else log.timestamp_s[rows]
-        curve_m = None if log.shared_stddev_m is None else shared_m
         found = dict(zip(heard.tolist(), judged_fits(fits, times_s, log.tag_index[rows], curve_m), strict=True))
     placements = []
     for k, anchor_id in enumerate(log.anchor_ids):
