@@ -57,33 +57,10 @@ MAX_SECONDS = 300.0
 # address space than it uses.
 MAX_BYTES = 8 << 30
 OWN_WORDS = (
-    "Traceback",
-    "internal error",
-    "terminate called",
-    "Warning:",
-    "*** ",
-    "Segmentation",
-    "LAPACK",
-    "** On entry",
+    *("Traceback", "internal error", "terminate called", "Warning:", "*** ", "Segmentation", "LAPACK", "** On entry"),
 )
 NUMBERS = (
-    0.0,
-    1e-320,
-    1e-300,
-    1e-160,
-    1e-20,
-    1e-9,
-    1e-6,
-    1e3,
-    1e6,
-    1e9,
-    1e10,
-    1e15,
-    1e80,
-    1e160,
-    1e308,
-    np.nan,
-    np.inf,
+    *(0.0, 1e-320, 1e-300, 1e-160, 1e-20, 1e-9, 1e-6, 1e3, 1e6, 1e9, 1e10, 1e15, 1e80, 1e160, 1e308, np.nan, np.inf),
 )
 VALUES: tuple[object, ...] = (None, True, [], {}, "text", "", [[]], {"a": 1}, "\x00", "../..", 10**400, -1, 2**63)
 MODEL = ("out/sparse/0/cameras.bin", "out/sparse/0/images.bin", "out/sparse/0/points3D.bin", "out/sparse/0/frames.bin")
