@@ -18,6 +18,7 @@ fewer than nine in ten mistakes are named.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 from collections.abc import Callable
@@ -203,10 +204,11 @@ def main() -> int:
     parser.add_argument("--num_mistakes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    all_covered, rovers_told = [], []
+    all_covered, rovers_told, seeds = [], [], itertools.count(args.seed)
     for name, motion in MOTIONS.items():
         for of_grade in GRADES:
-            found = [surveyed(motion(args.seed + k), of_grade, args.seed + k) for k in range(args.num_seeds)]
+            own = [next(seeds) for _ in range(args.num_seeds)]  # else all sorts would have the same errors of gravity
+            found = [surveyed(motion(seed), of_grade, seed) for seed in own]
             known = [each for each in found if np.isfinite(each.half_width)]
             errors = np.array([[each.scale, each.vertical] for each in known]).reshape(-1, 2)
             covered = np.abs(errors[:, 0]) <= 1.96
