@@ -28,7 +28,7 @@ from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
 from rangesfm.util.files.output_folder import PRIVATE_NAME
 from rangesfm.util.geometry.reference import Reference, write_reference
 
-# Rendered once; the renderer of the yard is in the history of this repository, last in 28c036a2 at tests/rendering.
+# Rendered by tests/rendering/make_demo_photos.py.
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"
 NUM_PHOTOS = 40
