@@ -92,7 +92,7 @@ class Rays:
         found = zip(self.views, self.in_cam, self.by_pixel, strict=True)
         return [-by_pixel @ _by_params(view.camera, at) for view, at, by_pixel in found]
 
-    @property
+    @cached_property
     def by_pixel(self) -> Array:
         """(k, 3, 2) derivatives of the directions in their cameras by the pixels."""
         return np.asarray(np.linalg.pinv(self.pixel_by_point))

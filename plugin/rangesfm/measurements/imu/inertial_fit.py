@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
@@ -333,9 +334,10 @@ class LinearMotion:
             max_num: largest number of combinations, if one stretch has no more; the stretches are evenly chosen.
         """
         stretches = self.stretches(sizes)
-        most = max(max_num // max(len(each.combination) + len(each.bends) for each in stretches), 1)
+        # Of each photo a velocity is eliminated, and all else is left.
+        most = max(max_num // max(each.by_velocity.shape[0] - each.by_velocity.shape[1] for each in stretches), 1)
         chosen = np.unique(np.linspace(0, len(stretches) - 1, most).round().astype(np.int64)).tolist()
-        parts = [(each, rows) for each in (stretches[k] for k in chosen) for rows in (each.combination, each.bends)]
+        parts = [(each, rows) for each in (stretches[k] for k in chosen) for rows in (each.combination, each.bends[0])]
         return self._level(self._of_all(parts))
 
     def _of_all(self, parts: Iterable[tuple[Stretch, Array]]) -> Array:
@@ -368,10 +370,10 @@ class LinearMotion:
             found = np.zeros((basis.shape[1], len(self.intervals), 9))
             found[:, np.concatenate([each.rows for each in of_group])] = (basis.T @ own).reshape(basis.shape[1], -1, 9)
             parts.append(found)
-        shares = np.sort(np.concatenate([each.bend_shares for each in stretches]))[::-1]
+        shares = np.sort(np.concatenate([each.bends[1] for each in stretches]))[::-1]
         num_left = max_num - sum(len(each) for each in parts)
         least = max([UNDETERMINED, *shares[max(num_left, 0) :][:1]])
-        parts.append(self._of_all((each, each.bends[each.bend_shares > least]) for each in stretches))
+        parts.append(self._of_all((each, each.bends[0][each.bends[1] > least]) for each in stretches))
         coefficients = np.concatenate(parts)
         return Combinations(coefficients, self) if keeps_direction else self._level(coefficients)
 
@@ -425,8 +427,8 @@ class Stretch:
         strength_of_errors: expected square of what errors of the most likely places would add to the derivative by the
             scale, in standard deviations of the errors, without what velocities explain.
         combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1, by which the errors
-            depend on what is shared. bends: (b, 9 m) all others. bend_shares: (b,) parts of their variances that are
-            due to the bending of the map, on which they depend one by one.
+            depend on what is shared.
+        by_pose: (9 m, 6 q). bent: (6 q, 6 q) covariance of the photos' poses by the bending of the map.
     """
 
     rows: Indices
@@ -441,8 +443,8 @@ class Stretch:
     of_places: Array
     strength_of_errors: float
     combination: Array
-    bends: Array
-    bend_shares: Array
+    by_pose: Array
+    bent: Array
 
     @classmethod
     def of(cls, rows: Indices, motion: LinearMotion, sizes: Sizes) -> Stretch:
@@ -473,11 +475,7 @@ class Stretch:
         left = left / np.maximum(np.linalg.norm(left, axis=0), 1e-300)
         turned, strengths, _ = np.linalg.svd(left - basis @ (basis.T @ left), full_matrices=False)
         turned = turned[:, strengths > UNDETERMINED]
-        others = np.linalg.qr(np.hstack([basis, turned]), mode="complete")[0][:, basis.shape[1] + turned.shape[1] :]
-        effects = others.T @ solve_triangular(lower, by_pose, lower=True)
-        bend_shares, bends = np.linalg.eigh(effects @ bent @ effects.T)
-        turned_back = solve_triangular(lower, np.hstack([turned, others @ bends]), lower=True, trans=1).T
-        combination, bends = np.split(turned_back, [turned.shape[1]])
+        combination = solve_triangular(lower, turned, lower=True, trans=1).T
         # Places err by those of the poses, and where the camera was at another time.
         moved = block_diag(*(sizes["photo_times"] * motion.rates[photos, 3:, None]))
         of_places = of_poses[places] @ by_pose.T + moved @ late.T
@@ -488,8 +486,21 @@ class Stretch:
         residual, grown = motion.errors.residual[rows].ravel(), motion.grown[rows].ravel()
         return cls(
             *(rows, before, after, photos, residual, grown, own, lower, by_velocity, of_places, strength),
-            *(combination, bends, bend_shares),
+            *(combination, by_pose, bent),
         )
+
+    @cached_property
+    def bends(self) -> tuple[Array, Array]:
+        """(b, 9 m) all other combinations, and the parts (b,) of their variances that are due to the map's bending.
+
+        They do not depend on velocities either, have a covariance of 1, and depend on the bending one by one.
+        """
+        by_velocity = solve_triangular(self.lower, self.by_velocity, lower=True)
+        seen = np.hstack([by_velocity, self.lower.T @ self.combination.T])
+        others = np.linalg.qr(seen, mode="complete")[0][:, seen.shape[1] :]
+        effects = others.T @ solve_triangular(self.lower, self.by_pose, lower=True)
+        shares, turned = np.linalg.eigh(effects @ self.bent @ effects.T)
+        return np.asarray(solve_triangular(self.lower, others @ turned, lower=True, trans=1).T), shares
 
     def _left(self, step: Array) -> Array:
         return self.residual + self.grown * step[SCALE] + self.shared[:, GRAVITY.start :] @ step[GRAVITY.start :]
