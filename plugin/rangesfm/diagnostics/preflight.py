@@ -300,11 +300,8 @@ def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor], in_open_unit: P
     bad = triangles.bad_pairs(positions_m)
     if not bad.any():
         return
-    num_bad, num_pairs, causes = (
-        int(bad.sum()),
-        len(ids) * (len(ids) - 1) // 2,
-        [*_causes(triangles, ids, positions_m, bad)],
-    )
+    num_bad, num_pairs = int(bad.sum()), len(ids) * (len(ids) - 1) // 2
+    causes = [*_causes(triangles, ids, positions_m, bad)]
     found = f"in {num_bad} of {num_pairs} pairs of anchors, their coordinates and the ranges contradict each other"
     are_of_unit = causes and all(cause.endswith(tuple(_UNITS.values())) for cause in causes) and 2 * num_bad > num_pairs
     if in_open_unit is not None and are_of_unit:
