@@ -588,7 +588,7 @@ class TestBesideTheMap:
         short = -0.3 * np.exp(-log.range_m)
         assert np.abs(short).max() > 0.05
         observations = replace(survey.observations, log=replace(log, range_m=log.range_m + short))
-        stddev = np.hypot(0.03, shared_stddev(observations.log))
+        stddev = np.hypot(0.03, shared_stddev(observations.log.range_m, None))
         _, held = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev)
         assert held.ranges.short_range_error_m is None
         options = RefineOptions(short_range_stddev_m=0.3)

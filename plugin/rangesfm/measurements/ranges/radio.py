@@ -104,7 +104,7 @@ def lengths_by_radio(
     noise = np.where(np.isfinite(given), given, noise_m)
     medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
     mean_square = np.bincount(index, noise**2, len(pairs)) / count
-    shared = np.bincount(index, shared_stddev(log)[rows], len(pairs)) / count
+    shared = np.bincount(index, shared_stddev(log.range_m, log.shared_stddev_m)[rows], len(pairs)) / count
     first, second = pairs.reshape(-1, 2).T
     variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
     variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2

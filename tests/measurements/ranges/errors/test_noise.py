@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from rangesfm.measurements.ranges.errors.noise import (
@@ -18,8 +16,8 @@ def test_short_ranges_share_an_error_that_fades_within_metres() -> None:
     expected = [2.0, 2.0 * np.exp(-1.0), 2.0 * np.exp(-4.0)]
     np.testing.assert_allclose(short_range_stddev(np.array([0.0, 1.0, 4.0])), expected)
     log = RangeLog.from_arrays(["a", "a"], [1.0, 4.0], timestamp_s=[0.0, 1.0])
-    np.testing.assert_allclose(shared_stddev(log), expected[1:])
-    np.testing.assert_array_equal(shared_stddev(replace(log, shared_stddev_m=np.array([0.3, 0.4]))), [0.3, 0.4])
+    np.testing.assert_allclose(shared_stddev(log.range_m, log.shared_stddev_m), expected[1:])
+    np.testing.assert_array_equal(shared_stddev(log.range_m, np.array([0.3, 0.4])), [0.3, 0.4])
 
 
 def test_whitened_biases_are_independent_with_variance_one() -> None:

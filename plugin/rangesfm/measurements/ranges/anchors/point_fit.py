@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
-from rangesfm.measurements.ranges.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise, short_range_stddev
+from rangesfm.measurements.ranges.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise, shared_stddev
 from rangesfm.measurements.ranges.errors.range_bins import noisiness, range_bins
 from rangesfm.measurements.ranges.scale.range_equation import (
     RangeFit,
@@ -162,18 +162,14 @@ def fit_with_own_noise(problem: RangeProblem, curve_stddev_m: Array | None, give
         curve_stddev_m: (n,) of a learnt error curve that was subtracted; None if none was.
         given_m: (n,) noise of each range, NaN where it is unknown.
     """
-
-    def shared_stddev_m(distance_m: Array) -> Array:
-        return short_range_stddev(distance_m) if curve_stddev_m is None else curve_stddev_m
-
     is_given = np.isfinite(given_m)
     unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else START_STDDEV_M)
-    state, noise = _best_start(problem, shared_stddev_m(problem.range_m), unit)
+    state, noise = _best_start(problem, shared_stddev(problem.range_m, curve_stddev_m), unit)
     least = 1.0 if is_given.all() else 0.0
     noise = max(noise, least)
     for _ in range(MAX_NUM_ROUNDS):
         # By the distance from the anchor: garbage that reads short is none of the short ranges that err together.
-        shared_m = shared_stddev_m(range_gradient(problem, state).distance_m)
+        shared_m = shared_stddev(range_gradient(problem, state).distance_m, curve_stddev_m)
         now = replace(problem, stddev_m=np.hypot(noise * unit, shared_m))
         found = PointFit(now, solve(now, state, held=known_directions(now)), noise * unit)
         state = found.fit.state

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NUM_REWEIGHTINGS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import (
     CAUCHY,
@@ -62,9 +61,9 @@ def short_range_stddev(distance_m: Array) -> Array:
     return _SHORT_RANGE_STDDEV_M * np.exp(-distance_m / SHORT_RANGE_LENGTH_M)
 
 
-def shared_stddev(log: RangeLog) -> Array:
+def shared_stddev(distance_m: Array, curve_stddev_m: Array | None) -> Array:
     """Return the (n,) stddev of errors that ranges of similar length share, by the error curve or for short ranges."""
-    return short_range_stddev(log.range_m) if log.shared_stddev_m is None else log.shared_stddev_m
+    return short_range_stddev(distance_m) if curve_stddev_m is None else curve_stddev_m
 
 
 def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:

@@ -99,7 +99,7 @@ class RangeErrors:
         if range_model.range_stddev_m is not None:
             given = np.where(np.isfinite(given), given, range_model.range_stddev_m)
         times = None if log.timestamp_s is None else log.timestamp_s[rows]
-        shared, nothing = shared_stddev(log)[rows], np.zeros(len(rows), dtype=np.int64)
+        shared, nothing = shared_stddev(log.range_m, log.shared_stddev_m)[rows], np.zeros(len(rows), dtype=np.int64)
         return cls(
             stddev_m=np.hypot(np.where(np.isfinite(given), given, START_STDDEV_M), shared),
             share=np.ones(len(rows)),

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
-from rangesfm.measurements.ranges.errors.noise import short_range_stddev
+from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.scale.anchor_plane import is_on_side, mirrored_map, on_side
@@ -197,9 +197,9 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
         placed = state.metric_from_model
         errors = errors.at(antenna_positions(given, placed), posed.placing_stddev_m(placed.scale))
-        if posed.curve_stddev_m is None:
-            # By the distance on the map: garbage that reads short is none of the short ranges that err together.
-            errors = replace(errors, shared_m=short_range_stddev(range_gradient(given, state).distance_m))
+        # By the distance on the map: garbage that reads short is none of the short ranges that err together.
+        distance_m = range_gradient(given, state).distance_m
+        errors = replace(errors, shared_m=shared_stddev(distance_m, posed.curve_stddev_m))
         return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
 
     def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:
