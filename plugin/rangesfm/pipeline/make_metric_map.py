@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,37 +36,41 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         GeometryError: the scale is not determined, or is less certain than asked for.
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
-    pieces = _pieces_not_held(run, path)
     with run.journal.stage("scale"):
-        metric = scale_by_survey(run, path, is_a_start=refine)
+        pieces = loose_pieces(path.sfm)
+        # Which parts hang together, and which measurements contradict the others, depends on how the photos may bend.
+        depends = pieces or run.inputs.may_be_left_out or not refine
+        bending = bending_by_survey(run.survey, path) if depends else path.as_walk
+        pieces = _not_held(pieces, bending)
+        metric = scale_by_survey(run, path, bending, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
             metric = with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
         metric = close_loops_of_survey(run, metric)
         loops, final = None if metric.kept is None else metric.kept.loops, metric.final
         if pieces and loops is not None and loops.closed:  # loops hold pieces that neighbours do not
-            pieces = _pieces_not_held(run, replace(path, sfm=final, trajectory=path.trajectory.as_in(final)))
+            closed = replace(path, sfm=final, trajectory=path.trajectory.as_in(final))
+            pieces = _not_held(loose_pieces(final), bending_by_survey(run.survey, closed))
     of_pieces = doubts_of_pieces(pieces, path.sfm.num_reg_images())
     run.journal.warn(*(doubt.reason for doubt in of_pieces))
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
 
 
-def _pieces_not_held(run: SurveyRun, path: PathOfModel) -> tuple[LoosePiece, ...]:
-    """Return the parts of a model that share few points with the rest, which do not determine their scale."""
-    pieces = loose_pieces(path.sfm)
-    bending = bending_by_survey(run.survey, path) if pieces else None
+def _not_held(pieces: Sequence[LoosePiece], bending: MapBending) -> tuple[LoosePiece, ...]:
+    """Return the parts of a model that share few points with the rest, if its photos do not determine their scale."""
     if not isinstance(bending, PhotoBending):  # the photos determine nothing, or are too many to tell
-        return pieces
+        return tuple(pieces)
     return tuple(piece for piece in pieces if not bending.hold_together(piece.image_names))
 
 
-def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> MetricResult:
+def scale_by_survey(run: SurveyRun, path: PathOfModel, bending: MapBending, *, is_a_start: bool) -> MetricResult:
     """Estimate the scale and return the rescaled map.
 
     Args:
         run: the survey.
         path: model with the ranges on its path.
+        bending: of the model.
         is_a_start: whether a refinement follows. Then the refined map is judged, and not this one.
 
     Raises:
@@ -74,15 +79,13 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     survey, inputs, offset = run.survey, run.inputs, path.time_offset
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
-    # Which measurements contradict the others depends on how far the photos let the map drift.
-    bending = path.as_walk if is_a_start and not inputs.may_be_left_out else bending_by_survey(survey, path)
     limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
     except GeometryError as error:
         if run.doubts:
             raise GeometryError("; ".join([str(error), *(doubt.reason for doubt in run.doubts)])) from None
-        raise _refused_with_cause(error, run, path) from None
+        raise _refused_with_cause(error, run, path, bending) from None
     if not is_a_start:
         estimate = estimate.where_bent(survey.scale)
     scaled, kept = rescale(path.sfm, estimate.metric_from_sfm), without_contradicted(inputs, estimate.kinds)
@@ -94,11 +97,10 @@ def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:
     return bending_of_model(path.sfm, path.trajectory, survey.camera, survey.refine, survey.mapper.num_threads)
 
 
-def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel) -> GeometryError:
+def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel, bending: MapBending) -> GeometryError:
     """Return the refusal, with the likeliest mistake added if the ranges show one on a map with any uncertainty."""
-    lenient, bending = run.changed({"scale.max_relative_stddev": _ANY_STDDEV}), bending_by_survey(run.survey, path)
     try:
-        estimate = lenient.estimate_scale(path, bending)
+        estimate = run.changed({"scale.max_relative_stddev": _ANY_STDDEV}).estimate_scale(path, bending)
     except (GeometryError, np.linalg.LinAlgError):
         return error
     return with_cause(error, estimate.on_map)
