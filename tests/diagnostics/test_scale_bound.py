@@ -17,6 +17,7 @@ from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
 from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.mistakes import RISK, HiddenMistake
+from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import ScaleUncertainty
 
 ONE_PERCENT = ScaleUncertainty(0.0, {"noise": 0.01})
@@ -65,13 +66,12 @@ def test_what_people_would_notice_limits_what_no_test_sees() -> None:
 
 def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: Linearized) -> None:
     """The residuals themselves are compared: with all unknowns adapting to the mistake, and on a map that is known."""
-    silent = replace(problem, residual_m=0 * problem.residual_m, prior_residual=0 * problem.prior_residual)
-    inverse = np.linalg.inv(problem.errors.covariance_m2)
+    inverse = np.linalg.inv(problem.noise.covariance_m2)
     for test in results_of(problem):
         columns, seen, num = test.hypothesis.columns, test.hypothesis.seen, len(problem.bins)
         off_m = columns[:num] if seen is None else seen
-        of_units = [replace(silent, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
-        left = np.stack([Factorization(made).residual for made in of_units], axis=1)
+        of_units = [replace(problem.linear, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
+        left = np.stack([Factorization(replace(problem, linear=made)).residual for made in of_units], axis=1)
         directions = np.random.default_rng(0).standard_normal((test.hypothesis.num, 1000))
         shares = np.sum((left @ directions) ** 2, axis=0)
         shares /= np.einsum("ij,ik,kj->j", off_m @ directions, inverse, off_m @ directions)
@@ -83,8 +83,8 @@ def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: L
 def test_what_two_anchors_alone_are_given_is_untested(problem: Linearized) -> None:
     """Three coordinates of each of two anchors determine the map, and nothing is left to check them."""
     few = np.isin(problem.bins.anchor_index, problem.heard[:2])
-    loose = np.where(few[:, None] & few, problem.errors.covariance_m2, 0.0) + 1e8 * np.diag(~few)
-    lonely = replace(problem, errors=replace(problem.errors, covariances_m2=loose[None]))
+    loose = np.where(few[:, None] & few, problem.noise.covariance_m2, 0.0) + 1e8 * np.diag(~few)
+    lonely = replace(problem, components=(Component("loose", loose),), sizes={"loose": 1.0})
     places = {test.hypothesis.subject: test for test in results_of(lonely) if test.hypothesis.name == "anchor place"}
     assert places
     assert not any(test.is_checked for test in places.values())

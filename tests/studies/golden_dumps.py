@@ -235,11 +235,11 @@ def range_equations_of(metric: MetricResult) -> Values:
     moved = ranges.moved(on_map.posterior) if on_map.is_at_rest else ranges
     problem = linearized(moved.on(on_map)).with_learnt_errors()
     return {
-        "ranges residual": problem.residual_m,
-        "ranges derivatives": problem.design,
-        "ranges prior residual": problem.prior_residual,
-        "ranges prior derivatives": problem.prior_design,
-        "ranges covariance": problem.errors.covariance_m2,
+        "ranges residual": problem.linear.residual_m,
+        "ranges derivatives": problem.linear.design,
+        "ranges prior residual": problem.linear.prior_residual,
+        "ranges prior derivatives": problem.linear.prior_design,
+        "ranges covariance": problem.noise.covariance_m2,
     }
 
 

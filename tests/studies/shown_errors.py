@@ -23,6 +23,8 @@ from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
 from rangesfm.measurements.ranges.scale.range_equation import predicted_ranges
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
 from rangesfm.measurements.ranges.scale.solution import solve_scale
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.trajectory import in_first_camera
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
@@ -66,7 +68,7 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
         bias_m=posed.ranges.bias_mean_m,
     )
     solution = replace(solution, fit=replace(solution.fit, state=true))
-    ranges = binned_ranges(posed, solution)
+    ranges = binned_ranges(posed, solution, WalkBending(in_first_camera(path)))
     bins = ranges.bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))

@@ -61,12 +61,13 @@ class RangesAtTruth:
     """Planned ranges without errors, on the true map.
 
     Attributes:
-        posed: the scale problem. solution: its true state, with the weight of each range.
+        posed: the scale problem. solution: its true state, with the weight of each range. bending: of the map.
         learned: errors to expect of them, with those of the map's bending.
     """
 
     posed: ScaleProblem
     solution: Solution
+    bending: MapBending
     learned: LearnedErrors
 
 
@@ -234,7 +235,7 @@ def expect(
     gravity = None if sensor is None or not planned.anchors else sensor.upward
     observed: list[Observations] = [] if positions is None else [positions]
     if planned.anchors:
-        posed, solution, binned = _ranges(planned, placement, gravity, max_num_bins)
+        posed, solution, binned = _ranges(planned, the_map.bending, placement, gravity, max_num_bins)
         observed.insert(0, binned)
     if planned.taped:
         observed.append(lengths_on_map(planned.taped_lengths, 1.0, path, np.ones(len(planned.taped), dtype=bool)))
@@ -244,7 +245,9 @@ def expect(
     problem, known, keyframe_stddevs_m = the_map.solved(observed)
     ranges = None
     if planned.anchors:
-        ranges = RangesAtTruth(posed, solution, LearnedErrors.from_noise(problem.noise_of(RANGES), binned.bins))
+        ranges = RangesAtTruth(
+            posed, solution, the_map.bending, LearnedErrors.from_noise(problem.noise_of(RANGES), binned.bins)
+        )
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
     notes = (*notes, *why_not)
     return Expected(planned, vision, ranges, known, keyframe_stddevs_m, num_positions, notes, sensor)
@@ -284,7 +287,11 @@ def _sensor(planned: PlannedSurvey, the_map: _BendingMap) -> tuple[PlannedScale 
 
 
 def _ranges(
-    planned: PlannedSurvey, placement: PlacementPrior | None, gravity: Gravity | None, max_num_bins: int
+    planned: PlannedSurvey,
+    bending: MapBending,
+    placement: PlacementPrior | None,
+    gravity: Gravity | None,
+    max_num_bins: int,
 ) -> tuple[ScaleProblem, Solution, BinnedRanges]:
     """Return the scale problem of the ranges, its true state, and the ranges, which are weighted by their noise."""
     posed = planned.posed(planned.observations(), placement, gravity)
@@ -294,7 +301,7 @@ def _ranges(
     problem = weighted(posed.ranges, errors)
     weights = np.full(len(posed.rows), float(planned.num_alike))
     solution = Solution(problem, fit_at(problem, state, weights), errors, START_STDDEV_M)
-    found = binned_ranges(posed, solution, max_num_bins)
+    found = binned_ranges(posed, solution, bending, max_num_bins)
     sizes = _given_or_usual(found.components, planned.given_sizes)
     alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
     return posed, solution, replace(found, alone_m2=alone)

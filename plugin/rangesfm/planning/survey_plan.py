@@ -245,7 +245,7 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     ranges = expected.ranges
     if ranges is None:
         return ()
-    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, None), ranges.learned)
+    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, ranges.bending), ranges.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):

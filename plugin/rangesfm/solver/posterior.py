@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
@@ -17,7 +19,10 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
 from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, regular
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
-from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS, UNDETERMINED
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 GIVEN = "given"
 """Effect of priors; not a component of the noise."""
@@ -172,6 +177,12 @@ class JointProblem:
         """Errors of all observations."""
         return noise_of_sizes(self.components, self.sizes, len(self.is_used))
 
+    @property
+    def unlikeliness(self) -> float:
+        """-2 times the logarithm of the prior probability of the sizes, up to a constant."""
+        learnt = (each for each in self.components if each.spread > 0)
+        return float(sum((np.log(self.sizes[each.name] / each.median) / each.spread) ** 2 for each in learnt))
+
     def without(self, kind: str, name: str) -> JointProblem:
         """Return the problem without one component of the errors of a kind."""
         rows = self.rows[kind]
@@ -202,18 +213,30 @@ class JointProblem:
         expected_m = float(np.sqrt(np.trace(self.bending.formal_m2) / len(self.is_used)))
         return self.noise.stddev_of_component["bending"] / expected_m if expected_m > 0 else 1.0
 
-    def learnt(self, *mistakes: Array, most_unusual: float = np.inf) -> JointProblem:
+    def learnt(
+        self,
+        *mistakes: Array,
+        most_unusual: float = np.inf,
+        most_bent: float = np.inf,
+        near: Mapping[str, float] = MappingProxyType({}),
+    ) -> Self:
         """Return the problem with the sizes of the errors that the observations show.
 
         Args:
-            mistakes: (c, m) columns of each. They explain what they can, as the errors that they cause would otherwise
-                be taken for noise, in which they then hide.
-            most_unusual: largest size of a component above its median, in spreads over surveys.
+            mistakes: (c, m) effects of each on the observations, or (c + r, m) also on the priors. They explain what
+                they can, as the errors that they cause would otherwise be taken for noise, in which they then hide.
+            most_unusual, most_bent: largest size of a component above its median, in spreads over surveys, of what
+                errs in measurements, and in the map.
+            near: sizes in nearly the same problem to start from, by name, which takes half the time.
         """
-        used, linear = self.is_used, self.linear
-        design = np.hstack([linear.design, *mistakes])[used]
+        used, linear, num = self.is_used, self.linear, len(self.is_used)
+        num_rows = num + len(linear.prior_residual)
+        effects = [np.pad(each, ((0, num_rows - len(each)), (0, 0))) for each in mistakes]
+        columns = np.hstack([np.vstack([linear.design, linear.prior_design]), *effects])
+        # Residuals are taken where those of the priors are smallest.
+        back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=UNDETERMINED)[0]
         # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
-        most_bent = np.inf if len(self.rows) == 1 else SIGNIFICANT_STDDEVS
+        most_bent = most_bent if len(self.rows) == 1 else min(most_bent, SIGNIFICANT_STDDEVS)
         components = self.components
         if not used.all():
             at = np.ix_(used, used)
@@ -223,10 +246,11 @@ class JointProblem:
             )
         sizes = learnt_sizes(
             components,
-            -linear.residual_m[used],
-            design,
-            np.pad(linear.prior_design, ((0, 0), (0, design.shape[1] - linear.design.shape[1]))),
-            {name: min(most_unusual, most_bent) if name in BENDS else most_unusual for name in self.sizes},
+            (linear.design @ back - linear.residual_m)[used],
+            columns[:num][used],
+            columns[num:],
+            {name: most_bent if name in BENDS else most_unusual for name in self.sizes},
+            near,
         )
         return replace(self, sizes=sizes)
 

@@ -190,7 +190,9 @@ class LengthScale(KindOnMap):
         def problem(kept: Mask) -> JointProblem:
             all_kinds = [*others, replace(self, is_kept=kept).observed(placed)]
             # A map that bends by significantly more than others do was mistaken, which must not pass for noise.
-            return joined(all_kinds, self.bending).learnt(most_unusual=SIGNIFICANT_STDDEVS)
+            return joined(all_kinds, self.bending).learnt(
+                most_unusual=SIGNIFICANT_STDDEVS, most_bent=SIGNIFICANT_STDDEVS
+            )
 
         def effect(of: JointProblem, k: int) -> Array:
             columns = np.zeros((len(of.is_used), 1))

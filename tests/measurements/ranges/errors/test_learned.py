@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal, norm
 from rangesfm.measurements.ranges.errors.components import COMPONENTS
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, range_bins
-from rangesfm.solver.noise import ComponentLikelihood, usual_sizes
+from rangesfm.solver.noise import ComponentLikelihood, learnt_sizes, usual_sizes
 
 Array = npt.NDArray[np.float64]
 
@@ -119,10 +119,9 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
 
 def test_errors_are_learnt_alike_from_a_start_nearby(walked: RangeBins) -> None:
     off_m = 0.1 * np.random.default_rng(2).standard_normal(len(walked))
-    given = (radio_components(walked), walked, off_m, np.zeros((len(walked), 1)), NO_MAP, 0.05)
-    learned = learn_errors(*given)
-    again = learn_errors(*given, near=learned.stddev_of_component)
-    np.testing.assert_allclose(again.stddevs, learned.stddevs, rtol=1e-3)
+    given = (radio_components(walked), off_m, np.zeros((len(walked), 1)), NO_MAP)
+    sizes = learnt_sizes(*given)
+    assert learnt_sizes(*given, near=sizes) == pytest.approx(sizes, rel=1e-3)
 
 
 def test_a_learnt_curve_counts_as_it_is_stated(walked: RangeBins) -> None:

@@ -37,11 +37,11 @@ def hypotheses(problem: Linearized) -> list[Hypothesis]:
 def with_mistake(problem: Linearized, mistake: Array) -> Linearized:
     """The problem without noise, with the effect of a mistake (c + r,) on bins and priors."""
     num = len(problem.bins)
-    return replace(problem, residual_m=mistake[:num], prior_residual=mistake[num:])
+    return replace(problem, linear=replace(problem.linear, residual_m=mistake[:num], prior_residual=mistake[num:]))
 
 
 def without_noise(problem: Linearized) -> Linearized:
-    return with_mistake(problem, np.zeros(len(problem.residual_m) + len(problem.prior_residual)))
+    return with_mistake(problem, np.zeros(len(problem.bins) + len(problem.linear.prior_residual)))
 
 
 def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> None:
@@ -111,17 +111,15 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
     problem: Linearized, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng, num = np.random.default_rng(1), 150
-    factor, tried = np.linalg.cholesky(problem.errors.covariance_m2), hypotheses(problem)
+    factor, tried = np.linalg.cholesky(problem.noise.covariance_m2), hypotheses(problem)
     thresholds = np.array([test.threshold for test in Factorization(problem).test(tried, 0)])
     # The thresholds do not depend on the measurements, and they are most of the work.
     monkeypatch.setattr(hypothesis_tests, "_thresholds", lambda *_: thresholds)
     alarms = 0
     for _ in range(num):
-        drawn = replace(
-            problem,
-            residual_m=factor @ rng.standard_normal(len(factor)),
-            prior_residual=rng.standard_normal(len(problem.prior_residual)),
-        )
+        num_priors = len(problem.linear.prior_residual)
+        off = np.append(factor @ rng.standard_normal(len(factor)), rng.standard_normal(num_priors))
+        drawn = with_mistake(problem, off)
         tests = Factorization(drawn).test(tried, 0)
         alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))
     assert stats.binom.sf(alarms - 1, num, FALSE_ALARM_RATE) > 0.001

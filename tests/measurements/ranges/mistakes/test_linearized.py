@@ -17,6 +17,7 @@ from rangesfm.measurements.ranges.mistakes.linearized import Linearized, lineari
 from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.solver.bending import Bending
 from rangesfm.util.geometry.similarity import Similarity
 
 NUM_POINTS, NUM_ANCHORS = 40, 3
@@ -74,6 +75,10 @@ def small_map(
         curve_stddev_m=None,
         placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         site=Site(),
+        trajectory=range(int(points.max()) + 2),
+    )
+    rigid: Any = SimpleNamespace(
+        of_functions=lambda by_pose, frame_is_free: Bending((), np.zeros((len(by_pose),) * 2), np.zeros(len(by_pose)))
     )
     return RangesOnMap(
         posed=posed,
@@ -83,7 +88,7 @@ def small_map(
         velocity=velocity if has_times else None,
         time_s=np.asarray(BEGIN_S + seconds),
         weights=np.ones(num),
-        bending=None,
+        bending=rigid,
     )
 
 
@@ -111,8 +116,8 @@ class TestDerivatives:
             moved = replace(on_map, state=state_after((problem.columns,), on_map.state, x))
             return problem.bins.mean(moved.residual_m)
 
-        np.testing.assert_allclose(problem.design, slopes(residual_m, problem.columns.num), atol=1e-7)
-        np.testing.assert_allclose(problem.residual_m, 0.0, atol=1e-12)
+        np.testing.assert_allclose(problem.linear.design, slopes(residual_m, problem.columns.num), atol=1e-7)
+        np.testing.assert_allclose(problem.linear.residual_m, 0.0, atol=1e-12)
 
     @pytest.mark.parametrize("frame_is_free", [True, False])
     def test_the_path_moves_with_the_map(self, frame_is_free: bool) -> None:

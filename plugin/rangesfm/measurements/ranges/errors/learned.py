@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -27,12 +26,10 @@ class LearnedErrors(Noise):
     Attributes:
         bins: of the ranges.
         of_range: (n,) bin of each range; -1 for a range that did not take part.
-        unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
     """
 
     bins: RangeBins
     of_range: Indices
-    unlikeliness: float = 0.0
 
     @classmethod
     def from_noise(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
@@ -101,8 +98,6 @@ def learn_errors(
     design: Array,
     prior_design: Array,
     noise_m: float,
-    most_unusual: float = np.inf,
-    near: Mapping[str, float] = MappingProxyType({}),
 ) -> LearnedErrors:
     """Learn the sizes of the components of the errors of c bins, as ``learnt_sizes``.
 
@@ -110,13 +105,7 @@ def learn_errors(
         components: of a radio with usual noise.
         off_m, design, prior_design: (c,), (c, p), (r, p), without any bias.
         noise_m: standard deviation of single ranges.
-        most_unusual: largest standard deviation of a radio's error above its median, in spreads over radios. A map may
-            bend by any amount.
-        near: sizes in nearly the same problem to start from, by name.
     """
     given = widened(components, noise_m)
-    most = {each.name: most_unusual for each in given if each.name not in BENDS}
-    sizes = learnt_sizes(given, off_m, design, prior_design, most, near)
-    off = [np.log(sizes[each.name] / each.median) / each.spread for each in given if each.spread > 0]
-    learned = LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)
-    return replace(learned, unlikeliness=float(np.sum(np.square(off))))
+    sizes = learnt_sizes(given, off_m, design, prior_design)
+    return LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)

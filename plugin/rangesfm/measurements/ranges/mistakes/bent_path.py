@@ -59,7 +59,7 @@ def _bent(on_map: RangesOnMap) -> RangesOnMap:
     for num in range(MAX_NUM_ROUNDS):
         if num:
             again = linearized(on_map) if num < _NUM_BINNED_ANEW else problem.at_other_map(on_map)
-            problem = again.with_learnt_errors(near=problem.errors.stddev_of_component)
+            problem = again.with_learnt_errors(near=problem.noise.stddev_of_component)
         before, on_map = on_map, _bent_once(problem)
         if is_nearly_at(on_map, before, problem.scatter_m):
             break
@@ -91,8 +91,8 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     on_map, walk = problem.on_map, problem.on_map.bending
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
-    moved, stddevs_m = problem.after_step(), problem.errors.stddev_of_component
-    pulls = cho_solve(cho_factor(regular(problem.errors.covariance_m2)), moved.residual_m)
+    moved, stddevs_m = problem.after_step(), problem.noise.stddev_of_component
+    pulls = cho_solve(cho_factor(regular(problem.noise.covariance_m2)), moved.linear.residual_m)
     by_pose = problem.bins.by_pose(on_map.by_poses, len(walk.path))
     sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.components if part.name in BENDS}
     bent = walk.bent_back(pulls @ by_pose, sizes, frame_is_free=is_free)

@@ -185,8 +185,8 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
 
 def _lasting_m(problem: Linearized) -> float:
     """Return the root mean square of the lasting errors over the bins, metres."""
-    lasting = np.isin(problem.errors.names, _LASTING)
-    variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
+    lasting = np.isin(problem.noise.names, _LASTING)
+    variances = np.trace(problem.noise.covariances_m2[lasting].sum(axis=0))
     return float(np.sqrt(variances / len(problem.bins)))
 
 

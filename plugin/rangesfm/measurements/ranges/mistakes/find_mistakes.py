@@ -135,7 +135,7 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
         is_sure: whether the nominated tests exceed their thresholds.
     """
     before = Factorization(_near_likeliest(problem).with_learnt_errors()).deviance()
-    num = len(problem.residual_m)
+    num = len(problem.bins)
     causes = []
     factorized = Factorization(problem)
     for test in _varied(nominated):
@@ -220,7 +220,7 @@ def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
         return cause
     best, deviance, state = min(tried, key=lambda each: each[1])
     test = replace(best, threshold=cause.test.threshold)
-    penalty = best.penalty(len(problem.residual_m))
+    penalty = best.penalty(len(problem.bins))
     narrow = Cause(test.hypothesis, test.sizes, before - deviance, penalty, state, test)
     return narrow if narrow.score > cause.score else cause
 
@@ -243,7 +243,7 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Hypothesis
     for near, each in found:
         gain, nothing = before - Factorization(near).deviance(), np.zeros(0)
         num_free = 3 * sum(place is None for place in each.correction(nothing).anchors_m.values())
-        penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.residual_m)))
+        penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.bins)))
         if gain > penalty + _AS_LIKELY:
             yield Cause(each, nothing, gain, penalty, near.on_map.state, None)
 
@@ -269,5 +269,5 @@ def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
         )
         for key, group in of_key.items()
     }
-    num = len(problem.residual_m)
+    num = len(problem.bins)
     return sorted(best.values(), key=lambda test: test.penalty(num) - test.statistic)

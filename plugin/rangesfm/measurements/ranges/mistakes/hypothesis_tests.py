@@ -66,8 +66,9 @@ class Factorization(Solved):
     """The solution of a problem, with the tests of all mistakes in it."""
 
     def __init__(self, problem: Linearized):
-        residual = np.append(problem.residual_m, problem.prior_residual)
-        super().__init__(problem.errors.covariance_m2, np.vstack([problem.design, problem.prior_design]), residual)
+        linear = problem.linear
+        residual = np.append(linear.residual_m, linear.prior_residual)
+        super().__init__(problem.noise.covariance_m2, np.vstack([linear.design, linear.prior_design]), residual)
         self.problem = problem
         # Quadratic form of the path's mean square displacement in the unknowns.
         place = problem.place.reshape(-1, problem.columns.num)
@@ -79,7 +80,7 @@ class Factorization(Solved):
         It compares two explanations of the same bins, each with the errors that it leaves.
         """
         squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
-        return squares + 2 * float(np.sum(np.log(np.diag(self.lower)))) + self.problem.errors.unlikeliness
+        return squares + 2 * float(np.sum(np.log(np.diag(self.lower)))) + self.problem.unlikeliness
 
     def step_with(self, mistake: Array) -> Array:
         """Return the (p,) step from the state to the likeliest one, given the effect (c + r,) of a mistake."""

@@ -11,13 +11,15 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.ranges.errors.components import DRIFT_S, WANDERING
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
-from rangesfm.solver.linear_map import LinearMap
-from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
+from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.noise import Component, usual_sizes
+from rangesfm.solver.posterior import JointProblem, joined
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
 from rangesfm.util.geometry.similarity import similarity_motions
@@ -40,24 +42,24 @@ _WANDERING_M = 0.025
 
 
 @dataclass(frozen=True)
-class Linearized(LinearMap):
-    """The linear problem of c bins of ranges and r priors; the anchors' biases are random errors.
+class Linearized(JointProblem):
+    """The linear problem of ranges in c bins alone, and of r priors; the anchors' biases are random errors.
 
-    Its residuals are those of the map as the photos alone would have it. Priors are first those of the anchors' places.
+    Priors are first those of the anchors' places.
 
     Attributes:
         on_map: the ranges. bins: how they are averaged.
         scatter_m: standard deviation of a range among its neighbours.
-        shift_m: (c,) change of the residuals from the map as it is to the map as the photos alone would have it.
-        components: of the errors. errors: the errors assumed random.
     """
 
     on_map: RangesOnMap
     bins: RangeBins
     scatter_m: float
-    shift_m: Array
-    components: tuple[Component, ...]
-    errors: LearnedErrors
+
+    @property
+    def columns(self) -> Columns:
+        """The p unknowns."""
+        return self.linear.columns
 
     @cached_property
     def time_s(self) -> Array:
@@ -95,36 +97,22 @@ class Linearized(LinearMap):
     def with_learnt_errors(
         self, mistakes: Sequence[Array] = (), near: Mapping[str, float] = MappingProxyType({})
     ) -> Linearized:
-        """Return the problem with the errors learnt while mistakes explain what they can.
+        """Return the problem with the errors learnt while mistakes explain what they can; arguments as of ``learnt``.
 
-        Args:
-            mistakes: (c + r, k) effects of each on the residuals.
-            near: sizes of the errors in nearly the same problem to start from, by name, which takes half the time.
+        A radio that errs by significantly more than others was mistaken, which must not pass for noise. A map may bend
+        by any amount.
         """
-        columns = np.hstack([np.vstack([self.design, self.prior_design]), *mistakes])
-        # Residuals are taken where the priors' residuals are smallest, with the map as it is.
-        back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
-        learnt = learn_errors(
-            self.components,
-            self.bins,
-            off_m=self.design @ back - self.residual_m,
-            design=columns[: len(self.bins)],
-            prior_design=columns[len(self.bins) :],
-            noise_m=self.scatter_m,
-            # A radio that errs by significantly more than others was mistaken, which must not pass for noise.
-            most_unusual=SIGNIFICANT_STDDEVS,
-            near=near,
-        )
-        return replace(self, errors=learnt)
+        return self.learnt(*mistakes, most_unusual=SIGNIFICANT_STDDEVS, near=near)
 
     def with_usual_errors(self) -> Linearized:
         """Return the problem with the errors usual for radios and maps with this scatter."""
-        return replace(self, errors=_usual_errors(self.components, self.bins, self.scatter_m))
+        return replace(self, sizes=usual_sizes(self.components) | {"white": self.scatter_m})
 
     def at_state(self, on_map: RangesOnMap) -> Linearized:
         """Linearise at another state or for corrected ranges, with the same bins and errors."""
         linear = on_map.linearized(self.bins)
-        return replace(self, **vars(linear) | {"residual_m": linear.residual_m + self.shift_m}, on_map=on_map)
+        linear = replace(linear, residual_m=linear.residual_m + self.bending.shift_m)
+        return replace(self, linear=linear, on_map=on_map)
 
     def at_other_map(self, on_map: RangesOnMap) -> Linearized:
         """Linearise the same ranges on another map, in the same bins, with the usual errors."""
@@ -136,10 +124,11 @@ class Linearized(LinearMap):
         A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height
         above a flat path. So a step that makes the state less likely is halved.
         """
-        solved = self.solved(self.errors.covariance_m2)
+        solved = self.linear.solved(self.noise.covariance_m2)
 
         def cost(of: Linearized) -> float:
-            return float(np.sum(solved.whitened(np.append(of.residual_m, of.prior_residual)[:, None]) ** 2))
+            residual = np.append(of.linear.residual_m, of.linear.prior_residual)
+            return float(np.sum(solved.whitened(residual[:, None]) ** 2))
 
         step, before = solved.step, cost(self)
         for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):
@@ -165,32 +154,22 @@ def linearized(on_map: RangesOnMap) -> Linearized:
     return _with_usual_errors(on_map, on_map.bins(weights, noise_of_anchor, _MAX_NUM_BINS), scatter_m)
 
 
-def expected_with(on_map: RangesOnMap, errors: LearnedErrors) -> Linearized:
+def expected_with(on_map: RangesOnMap, learned: LearnedErrors) -> Linearized:
     """Linearise ranges without noise, of a map that is not bent, with the errors to expect."""
-    return replace(_with_usual_errors(on_map, errors.bins, 0.0), errors=errors)
-
-
-def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
-    components = on_map.errors_of(bins, {WANDERING: _wandering_m2(bins)})
-    linear, bending, shift_m = on_map.linearized(bins), on_map.bending, np.zeros(len(bins))
-    if bending is not None:
-        by_pose = bins.by_pose(on_map.by_poses, len(bending.path))
-        bent = bending.of_functions(by_pose, frame_is_free=on_map.problem.frame_is_free)
-        components, shift_m = (*components, *bent.parts), bent.shift_m
-    return Linearized(
-        **vars(linear) | {"residual_m": linear.residual_m + shift_m},
-        on_map=on_map,
-        bins=bins,
-        scatter_m=scatter_m,
-        shift_m=shift_m,
-        components=components,
-        errors=_usual_errors(components, bins, scatter_m),
+    problem, errors = (
+        _with_usual_errors(on_map, learned.bins, 0.0),
+        zip(learned.names, learned.covariances_m2, strict=True),
+    )
+    return replace(
+        problem, components=tuple(Component(*each) for each in errors), sizes=dict.fromkeys(learned.names, 1.0)
     )
 
 
-def _usual_errors(components: Sequence[Component], bins: RangeBins, scatter_m: float) -> LearnedErrors:
-    sizes = usual_sizes(components) | {"white": scatter_m}
-    return LearnedErrors.from_noise(noise_of_sizes(components, sizes, len(bins)), bins)
+def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
+    alone_m2 = scatter_m**2 / np.maximum(bins.worth, 1e-12)
+    observed = in_bins(on_map, bins, scatter_m, {WANDERING: _wandering_m2(bins)}, alone_m2)
+    problem = joined([observed], on_map.bending)
+    return Linearized(**vars(problem), on_map=on_map, bins=bins, scatter_m=scatter_m).with_usual_errors()
 
 
 def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> bool:

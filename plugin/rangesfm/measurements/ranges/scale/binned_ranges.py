@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,10 +12,10 @@ from rangesfm.measurements.ranges.errors.components import CLOCKS, OtherError
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors, widened
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.scale.range_equation import fit_at, state_after
-from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution
-from rangesfm.solver.bending import BENDS
+from rangesfm.solver.bending import BENDS, MapBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import Observations, Posterior
 
@@ -32,16 +33,19 @@ class BinnedRanges(Observations):
     bins: RangeBins = field(kw_only=True)
 
 
-def binned_ranges(posed: ScaleProblem, solution: Solution, max_num_bins: int = MAX_NUM_OBSERVATIONS) -> BinnedRanges:
+def binned_ranges(
+    posed: ScaleProblem, solution: Solution, bending: MapBending, max_num_bins: int = MAX_NUM_OBSERVATIONS
+) -> BinnedRanges:
     """Average the ranges of a problem, and linearise them about its solution.
 
     Lengths between points and known positions in the problem, which help to solve it, are observations of their own
     here.
 
     Args:
+        bending: of the map.
         max_num_bins: fewer bins are coarser and take less time.
     """
-    on_map, fit = ranges_on_map(posed, solution, None), solution.fit
+    on_map, fit = ranges_on_map(posed, solution, bending), solution.fit
     distances, others_m2 = on_map.problem.distances, dict[OtherError, Array]()
     own = replace(on_map.problem, distances=distances.subset(~distances.is_between_points), placement=None)
     on_map = replace(on_map, problem=own)
@@ -50,12 +54,25 @@ def binned_ranges(posed: ScaleProblem, solution: Solution, max_num_bins: int = M
     if on_map.velocity is not None and (clock_s := posed.observations.time_offset_stddev_s):
         rates = bins.mean(on_map.by_time)
         others_m2[CLOCKS] = clock_s**2 * np.outer(rates, rates)
+    alone_m2 = 1 / np.maximum(bins.total(fit.weights / solution.errors.stddev_m**2), 1e-12)
+    return in_bins(on_map, bins, solution.noise_stddev_m, others_m2, alone_m2)
+
+
+def in_bins(
+    on_map: RangesOnMap, bins: RangeBins, noise_m: float, others_m2: Mapping[OtherError, Array], alone_m2: Array
+) -> BinnedRanges:
+    """Average ranges in bins, and linearise them about their state.
+
+    Args:
+        noise_m: standard deviation of single ranges. others_m2: as of ``RangesOnMap.errors_of``.
+        alone_m2: (c,) variances of the bins as if each single range erred independently.
+    """
     return BinnedRanges(
         **vars(on_map.linearized(bins)),
         kind=RANGES,
-        by_pose=bins.by_pose(on_map.by_poses, len(posed.trajectory)),
-        components=widened(on_map.errors_of(bins, others_m2), solution.noise_stddev_m),
-        alone_m2=np.diag(1 / np.maximum(bins.total(fit.weights / solution.errors.stddev_m**2), 1e-12)),
+        by_pose=bins.by_pose(on_map.by_poses, len(on_map.posed.trajectory)),
+        components=widened(on_map.errors_of(bins, others_m2), noise_m),
+        alone_m2=np.diag(alone_m2),
         is_used=np.ones(len(bins), dtype=bool),
         bins=bins,
     )

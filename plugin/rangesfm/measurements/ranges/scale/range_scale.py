@@ -80,7 +80,7 @@ class RangeScale(KindOnMap):
     ) -> BinnedRanges:
         """Linearise the ranges about their solution, which is at the placement."""
         del placed, in_site
-        return binned_ranges(self.posed, self.solution, max_num)
+        return binned_ranges(self.posed, self.solution, self.bending, max_num)
 
     @property
     def start(self) -> Similarity:
@@ -202,7 +202,7 @@ class RangeScale(KindOnMap):
         if not drifts(problem):
             return
         weights, rows = problem.bins.robust_weight, self.posed.rows
-        known = Posterior.best(problem, problem.errors, on_map.posterior.uncertainty.formal)
+        known = Posterior.best(problem.linear, problem.noise, on_map.posterior.uncertainty.formal)
         solution = replace(self.solution, fit=replace(self.solution.fit, state=bent.state, weights=weights))
         status, stddev_m = told.observations.status.copy(), told.errors.stddev_m.copy()
         status[rows], stddev_m[rows] = status_by_weight(weights), problem.scatter_m

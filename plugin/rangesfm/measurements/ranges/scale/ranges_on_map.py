@@ -44,7 +44,7 @@ class RangesOnMap:
         velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
         time_s: (n,) as ``ScaleProblem.times_s``.
         weights: (n,) robust weights in the estimate.
-        bending: of the map; None: the map is not bent.
+        bending: of the map.
     """
 
     posed: ScaleProblem
@@ -54,7 +54,7 @@ class RangesOnMap:
     velocity: Array | None
     time_s: Array
     weights: Array
-    bending: MapBending | None
+    bending: MapBending
 
     @property
     def anchor_ids(self) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ class RangesOnMap:
         return radio_components(bins, self.posed.curve_stddev_m, ruled_out, known_m2 | {**others_m2})
 
 
-def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending | None) -> RangesOnMap:
+def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending) -> RangesOnMap:
     """Collect the ranges of a problem at its solution."""
     return RangesOnMap(
         posed=posed,
