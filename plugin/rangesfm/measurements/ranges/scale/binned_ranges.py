@@ -8,10 +8,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.errors.components import CLOCKS, OtherError
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors, widened
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
-from rangesfm.measurements.ranges.scale.range_equation import fit_at, state_after
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeProblem,
+    fit_at,
+    prior_jacobian,
+    prior_residuals,
+    state_after,
+)
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution
@@ -46,8 +53,8 @@ def binned_ranges(
         max_num_bins: fewer bins are coarser and take less time.
     """
     on_map, fit = ranges_on_map(posed, solution, bending), solution.fit
-    distances, others_m2 = on_map.problem.distances, dict[OtherError, Array]()
-    own = replace(on_map.problem, distances=distances.subset(~distances.is_between_points), placement=None)
+    others_m2 = dict[OtherError, Array]()
+    own = replace(on_map.problem, distances=_of_anchors(on_map.problem), placement=None)
     on_map = replace(on_map, problem=own)
     noise_of_anchor = noisiness(own.anchor_index, fit.residuals_m, own.num_anchors)
     bins = on_map.bins(fit.weights, noise_of_anchor, max_num_bins)
@@ -79,9 +86,25 @@ def in_bins(
 
 
 def moved(solution: Solution, known: Posterior) -> Solution:
-    """Return the solution moved to the estimate of a posterior about it, with the same robust weights."""
-    state = state_after((known.columns,), solution.fit.state, known.step)
-    return replace(solution, fit=fit_at(solution.problem, state, solution.fit.weights))
+    """Return the solution moved to the estimate of a posterior about it, with the same robust weights.
+
+    The estimate is linear. An anchor that moves by much across a length that was surveyed would change it, so that the
+    anchors make one more step to where the priors are as the estimate has them.
+    """
+    problem, before, columns = solution.problem, solution.fit.state, known.columns
+    own = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors), distances=_of_anchors(problem), placement=None)
+    slopes = prior_jacobian(own, columns, before, before)
+    state = state_after((columns,), before, known.step)
+    linear = prior_residuals(own, columns, before) + slopes @ known.step
+    again = known.covariance @ slopes.T @ (linear - prior_residuals(own, columns, state))
+    again[columns.of_map] = 0.0
+    state = state_after((columns,), before, known.step + again)
+    return replace(solution, fit=fit_at(problem, state, solution.fit.weights))
+
+
+def _of_anchors(problem: RangeProblem) -> LocatedDistances:
+    """Return the distances between anchors; the others are observations of their own beside the ranges."""
+    return problem.distances.subset(~problem.distances.is_between_points)
 
 
 def shared_errors_m(solution: Solution, learned: LearnedErrors, of_range: Indices) -> Array:
