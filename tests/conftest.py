@@ -33,6 +33,7 @@ from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
 from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.similarity import Similarity
 
@@ -191,7 +192,7 @@ def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
     in_first_camera = (np.array(list(_AROUND_WALK_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
     write_anchors(folder / "anchors_first_camera.csv", dict(zip(ANCHORS_M, in_first_camera, strict=True)))
     names, centers_m = tuple(made.timestamps_s), made.centers_m + SITE_M
-    write_reference(Reference(centers_m, image_names=names), folder / "reference.csv")
+    write_reference(Reference(centers_m, ByPhoto(names)), folder / "reference.csv")
     site_from_sfm = Similarity(1.0, np.eye(3), np.array(SITE_M)) @ made.metric_from_sfm
     return WalkedSurvey(folder, site_from_sfm, centers_m, names)
 

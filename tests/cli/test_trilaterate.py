@@ -18,6 +18,7 @@ from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.sfm.image_times import read_image_times_csv
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
@@ -39,8 +40,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5), tmp_path / "uwb.csv")
     times = np.arange(0.0, 40.0, 0.1)
     centers, turns = path.centers(times), path.world_from_cam(times)
-    write_reference(Reference(centers, timestamps_s=times, world_from_cam=turns), tmp_path / "flight.csv")
-    write_reference(Reference(centers + turns @ TAG_IN_CAM_M, timestamps_s=times), tmp_path / "tag.csv")
+    write_reference(Reference(centers, ByTime(times), world_from_cam=turns), tmp_path / "flight.csv")
+    write_reference(Reference(centers + turns @ TAG_IN_CAM_M, ByTime(times)), tmp_path / "tag.csv")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -53,7 +54,7 @@ def write_flat(folder: Path) -> None:
     """Write ranges taken at named places in a plane: ``places.csv`` and ``uwb_places.csv``."""
     places = np.array([(x, y, 1.0) for x in (-3.0, 0.0, 3.0) for y in (-2.0, 0.0, 2.0, 4.0)])
     names = [f"p{k}" for k in range(len(places))]
-    write_reference(Reference(places, image_names=tuple(names)), folder / "places.csv")
+    write_reference(Reference(places, ByPhoto(tuple(names))), folder / "places.csv")
     ids = [anchor_id for anchor_id in ANCHORS_M for _ in names]
     ranges = [float(np.linalg.norm(place - anchor)) for anchor in ANCHORS_M.values() for place in places]
     write_ranges_csv(RangeLog.from_arrays(ids, ranges, image_name=names * len(ANCHORS_M)), folder / "uwb_places.csv")
@@ -89,7 +90,8 @@ def test_written_anchors_hold_a_survey_in_their_frame(
     path = trajectory_from_reconstruction(model, photo_times).transformed(
         placed.scale, placed.rotation, placed.translation
     )
-    known = Reference(path.centers, timestamps_s=path.timestamps_s, world_from_cam=path.world_from_cam)
+    assert path.timestamps_s is not None
+    known = Reference(path.centers, ByTime(path.timestamps_s), path.world_from_cam)
     write_reference(known, tmp_path / "known.csv")
     offset = walked_survey.flags[-1]
     flags = ("--positions", tmp_path / "known.csv", "--tag_in_cam", walked_survey.flags[-3], "--time_offset", offset)
@@ -195,7 +197,7 @@ class TestRefusal:
 
     def test_of_positions_on_a_line_is_status_3(self, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
         line = np.outer(np.arange(0.0, 40.0, 0.1), [0.1, 0.05, 0.0])
-        write_reference(Reference(line, timestamps_s=np.arange(0.0, 40.0, 0.1)), folder / "tag.csv")
+        write_reference(Reference(line, ByTime(np.arange(0.0, 40.0, 0.1))), folder / "tag.csv")
         distances = np.linalg.norm(line[::4] - [1.0, 4.0, 2.0], axis=1)
         log = RangeLog.from_arrays(["A1"] * len(distances), distances, timestamp_s=np.arange(0.0, 40.0, 0.4))
         write_ranges_csv(log, folder / "uwb.csv")

@@ -24,6 +24,7 @@ from rangesfm.comparison.with_reference import (
 )
 from rangesfm.errors import InputError
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
@@ -50,7 +51,7 @@ def walk(num: int = 30, seed: int = 0) -> tuple[Array, Array]:
 def reference_of(path: Trajectory, *, has_rotations: bool = True) -> Reference:
     return Reference(
         path.centers,
-        image_names=path.image_names,
+        ByPhoto(path.image_names),
         world_from_cam=path.world_from_cam if has_rotations else None,
     )
 
@@ -94,7 +95,7 @@ def test_the_first_camera_frame_is_reached_through_the_references_orientation() 
 
 def test_the_first_camera_frame_is_reached_from_the_first_keyframe_that_the_reference_knows() -> None:
     truth = make_path(*walk())
-    late = Reference(truth.centers[4:], image_names=truth.image_names[4:], world_from_cam=truth.world_from_cam[4:])
+    late = Reference(truth.centers[4:], ByPhoto(truth.image_names[4:]), world_from_cam=truth.world_from_cam[4:])
     (row,) = compare({"map": in_first_camera(truth)}, late, frame="first_camera")
     assert row.num_keyframes == 26
     assert row.rmse_m == pytest.approx(0.0, abs=1e-9)
@@ -157,11 +158,11 @@ def test_a_camera_that_stands_still_has_no_scale() -> None:
     ("reference", "message"),
     [
         (
-            Reference(np.zeros((1, 3)), image_names=("other.jpg",)),
+            Reference(np.zeros((1, 3)), ByPhoto(("other.jpg",))),
             "is of photo 'other.jpg', the first of the keyframes of photo '000.jpg'",
         ),
         (
-            Reference(np.zeros((2, 3)), timestamps_s=np.array([90.0, 90.5])),
+            Reference(np.zeros((2, 3)), ByTime(np.array([90.0, 90.5]))),
             r"90\.000 to 90\.500 s, .* from 0\.000 to 29\.000 s",
         ),
     ],
@@ -175,7 +176,7 @@ def test_the_reference_in_the_maps_frame_lies_on_a_perfect_path() -> None:
     truth = make_path(*walk())
     path = in_first_camera(truth)
     carried = reference_in_frame(path, reference_of(truth), frame="first_camera")
-    assert carried.image_names == path.image_names
+    assert carried.moments == ByPhoto(path.image_names)
     np.testing.assert_allclose(carried.positions_m, path.centers, atol=1e-9)
     assert not len(reference_in_frame(path, reference_of(truth, has_rotations=False), frame="first_camera"))
 

@@ -339,7 +339,6 @@ def with_ranges_between_anchors(survey: Survey, error_m: float = 0.0, first_pair
     log, ids = survey.observations.log, list(survey.anchors_m)
     pairs = list(itertools.combinations(ids, 2))[first_pair:]
     lengths = [np.linalg.norm(survey.anchors_m[a] - survey.anchors_m[b]) + error_m for a, b in pairs]
-    assert log.timestamp_s is not None
     both = RangeLog.from_arrays(
         [*np.array(log.anchor_ids)[log.anchor_index], *[b for _, b in pairs]],
         np.append(log.range_m, lengths),

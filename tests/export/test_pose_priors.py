@@ -33,14 +33,13 @@ def test_pose_priors_are_the_maps_positions_and_replace_others(tmp_path: Path, m
     first = images[0]
     map_ = MetricMap(model, database_path=tmp_path / "database.db", center_covariance_m2={first.name: 0.04 * np.eye(3)})
     log = read_pose_priors(write_pose_priors(map_, tmp_path / "pose_priors.db"))
-    assert log.image_name is not None
-    at = dict(zip(log.image_name, log.position_m, strict=True))
+    at = dict(zip(log.moments.image_name, log.position_m, strict=True))
     assert sorted(at) == [image.name for image in images]
     for image in images:
         np.testing.assert_array_equal(at[image.name], image.projection_center())
-    covariance = log.covariance_m2[log.image_name.index(first.name)]
+    covariance = log.covariance_m2[log.moments.image_name.index(first.name)]
     np.testing.assert_array_equal(covariance, 0.04 * np.eye(3))
-    assert np.isnan(log.covariance_m2[log.image_name.index(images[1].name)]).all()
+    assert np.isnan(log.covariance_m2[log.moments.image_name.index(images[1].name)]).all()
 
 
 def test_without_the_database_of_the_photos_one_line_says_so(tmp_path: Path, model: pycolmap.Reconstruction) -> None:

@@ -27,6 +27,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.image_times import ImageTimes, read_image_times_csv
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, read_reference
 from rangesfm.util.geometry.similarity import Similarity
 
@@ -84,7 +85,7 @@ def _check_log(log: RangeLog) -> None:
     """Check what the type of a log promises; some logs are also summed up, written and read again without loss."""
     _expect(len(log) > 0, "a log without ranges")
     _expect(np.all(np.isfinite(log.range_m)) and np.all(log.range_m > 0), "ranges that are finite and positive")
-    _expect(log.timestamp_s is None or np.all(np.isfinite(log.timestamp_s)), "times that are finite")
+    _expect(isinstance(log.moments, ByPhoto) or np.all(np.isfinite(log.timestamp_s)), "times that are finite")
     _expect(not np.any(log.range_stddev_m <= 0), "stddevs that are positive or unknown")
     _expect(not np.any(np.isinf(log.range_stddev_m)), "stddevs that are finite or unknown")
     _expect(all(name == name.strip() and name for name in (*log.anchor_ids, *log.tag_ids)), "ids that are some text")

@@ -139,7 +139,6 @@ def exact() -> Halves:
 
 def of_half(halves: Halves, number: int) -> npt.NDArray[np.bool_]:
     """(n,) whether each range was taken in this half."""
-    assert halves.log.timestamp_s is not None
     in_second: npt.NDArray[np.bool_] = halves.log.timestamp_s >= 99.5 + HALF
     return in_second if number == 1 else ~in_second
 

@@ -24,6 +24,7 @@ from rangesfm.progress import Journal, Progress
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import survey_from_tables
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.reference import Reference, write_reference
 
 IMAGE = raw(np.arange(48, dtype=np.uint8).reshape(6, 8, 1), "mono8")
@@ -77,7 +78,6 @@ def write_demo_as_bag(demo: DemoSurvey, folder: Path) -> None:
     """Write a bag with camera and radio, anchors named by the radio's numbers, and the truth by time."""
     folder.mkdir()
     log = demo.ranges
-    assert log.timestamp_s is not None
     messages: list[Message] = []
     for time_s, anchor_id, range_m in zip(
         log.timestamp_s.tolist(), log.end_ids()[1], log.range_m.tolist(), strict=True
@@ -95,7 +95,7 @@ def write_demo_as_bag(demo: DemoSurvey, folder: Path) -> None:
     write_bag(folder / "walk", sorted(messages, key=lambda message: message[2]))
     anchors = (demo.folder / "anchors.csv").read_text(encoding="utf-8")
     (folder / "anchors.csv").write_text(anchors.replace("\nA", "\n"), encoding="utf-8")
-    write_reference(Reference(demo.centers_m, timestamps_s=demo.timestamps_s), folder / "truth.csv")
+    write_reference(Reference(demo.centers_m, ByTime(demo.timestamps_s)), folder / "truth.csv")
 
 
 def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(

@@ -182,7 +182,6 @@ def test_ranges_held_out_check_the_result(survey: Survey) -> None:
 
 def test_an_anchor_and_a_stretch_of_time_can_be_held_out(survey: Survey) -> None:
     log = read_ranges(survey.ranges.path or "")
-    assert log.timestamp_s is not None
     anchor_id, times = log.anchor_ids[0], tuple(np.quantile(log.timestamp_s, [0.4, 0.5]).tolist())
     checked = survey.changed({"ranges.check_anchors": (anchor_id,), "ranges.check_times_s": times})
     result = refine_model(checked, progress=Progress()).summary

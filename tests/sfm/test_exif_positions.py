@@ -12,6 +12,7 @@ from PIL import Image
 from rangesfm.errors import InputError
 from rangesfm.sfm.exif_positions import read_exif_positions
 from rangesfm.survey.discovery.understood import understand
+from rangesfm.util.geometry.moments import ByPhoto
 
 GPS = 0x8825
 PLACE = {1: "N", 2: (47.0, 30.0, 36.0), 3: "W", 4: (8.0, 0.0, 0.0), 5: b"\0", 6: 400.0}
@@ -43,7 +44,7 @@ def test_the_accuracy_is_that_of_rtk_or_the_stated_error_or_by_the_dilution(
 ) -> None:
     write_photo(tmp_path / "photos" / "a.jpg", PLACE | more, **({"xmp": xmp} if xmp else {}))
     found = read_exif_positions(tmp_path / "photos")
-    assert (found.image_name, found.crs, found.timestamp_s) == (("a.jpg",), "EPSG:4979", None)
+    assert (found.moments, found.crs) == (ByPhoto(("a.jpg",)), "EPSG:4979")
     np.testing.assert_allclose(found.position_m, [[-8.0, 47.51, 400.0]])
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance_m2[0])), stddev_m)
 
@@ -59,7 +60,7 @@ def test_photos_without_a_fix_or_an_altitude_are_left_out(tmp_path: Path) -> Non
     }.items():
         write_photo(photos / name, tags)
     found = read_exif_positions(photos)
-    assert found.image_name == ("a.jpg",)
+    assert found.moments.image_name == ("a.jpg",)
     assert found.notes == ("photos: 1 of 2 EXIF positions have no altitude and are left out",)
     (photos / "a.jpg").unlink()
     with pytest.raises(InputError, match="no photo in it has an EXIF position with an altitude"):

@@ -43,6 +43,7 @@ from rangesfm.sfm.loops.loop_finder import LoopFinder
 from rangesfm.sfm.loops.merge import merge_tracks
 from rangesfm.sfm.loops.resection import Loop
 from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds, find_in
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.similarity import IDENTITY, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -162,7 +163,7 @@ def write_survey(looped: LoopedSurvey, folder: Path) -> None:
     write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
     write_anchors(folder / "anchors.csv", looped.survey.anchors_m)
     write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
-    reference = Reference(truth.centers_m, image_names=tuple(truth.timestamps_s), world_from_cam=truth.world_from_cam)
+    reference = Reference(truth.centers_m, ByPhoto(tuple(truth.timestamps_s)), world_from_cam=truth.world_from_cam)
     write_reference(reference, folder / "reference.csv")
 
 

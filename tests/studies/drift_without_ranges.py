@@ -55,6 +55,7 @@ from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import align_points, rmse
 
 Array = npt.NDArray[np.float64]
@@ -98,8 +99,8 @@ class Drifting:
         at_m = self.path.centers(times) + self.path.world_from_cam(times) @ TAG_IN_CAM_M
         at_m = at_m + receiver.errors_m(times, self.rng)
         covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
-        names = self.survey.trajectory.image_names if of_photos else ()
-        log = PositionLog(at_m, covariances, None if of_photos else times, names, np.arange(len(times)))
+        moments = ByPhoto(self.survey.trajectory.image_names) if of_photos else ByTime(times)
+        log = PositionLog(at_m, covariances, moments, np.arange(len(times)))
         offset = None if of_photos else TimeOffset.given(0.0)
         return SurveyedPositions(antenna=AntennaTrack(log, TAG_IN_CAM_M, offset, RangesOptions()))
 

@@ -110,8 +110,7 @@ def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
     (written if has_ranges else write_map)(survey, folder)
     tables = tables_of_files("site" if has_ranges else None)
     if "positions" in names:
-        assert track.log.timestamp_s is not None
-        rows = np.column_stack([track.log.timestamp_s, track.log.position_m])
+        rows = np.column_stack([track.log.moments.timestamp_s, track.log.position_m])
         stated_m = float(np.hypot(RECEIVERS["positions"].noise_m, RECEIVERS["positions"].lasting_m))
         header = "timestamp_s,x_m,y_m,z_m,stddev_m"
         write_rows(folder / "positions.csv", header, [(*row, stated_m) for row in rows.tolist()])

@@ -41,6 +41,7 @@ from tests.simulated.path import look_at
 from rangesfm.cli import main as run_command
 from rangesfm.demo.simulated_radio import Radio, measure_ranges
 from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 
 Array = npt.NDArray[np.float64]
@@ -111,7 +112,7 @@ def simulate(folder: Path, num: int, num_ranges_each: int, num_observations: int
     write_ranges(folder, made, num_ranges_each, rng)
     lines = [f"{name},{at!r}\n" for name, at in made.timestamps_s.items()]
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
-    write_reference(Reference(frames.centers, image_names=tuple(names)), folder / "reference.csv")
+    write_reference(Reference(frames.centers, ByPhoto(tuple(names))), folder / "reference.csv")
 
 
 def write_ranges(folder: Path, made: SyntheticModel, num_each: int, rng: np.random.Generator) -> None:

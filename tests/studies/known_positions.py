@@ -56,6 +56,7 @@ from rangesfm.pipeline.result_records import points_entry
 from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.survey.inputs import RangingInputs
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
@@ -66,7 +67,7 @@ Line = dict[str, Any]
 POINT_STDDEV_M = 0.01
 LEAST_COVERED = 0.9
 LEAP_S = 18.0
-NO_RANGES = RangeLog.from_arrays([], [], image_name=[])
+NO_RANGES = RangeLog.from_arrays([], [])
 KINDS_OF_SURVEY = ("yard", "room", "orbit of a drone", "way that never returns")
 
 
@@ -108,7 +109,7 @@ def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> 
     times, receiver = np.arange(first_s, last_s, 1.0), RECEIVERS["positions"]
     true_m = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
     covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
-    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, times, (), np.arange(len(times)))
+    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, ByTime(times), np.arange(len(times)))
     return AntennaTrack(log, TAG_IN_CAM_M, None, RangesOptions())
 
 
@@ -118,7 +119,7 @@ def exif_of(survey: MadeSurvey, rng: np.random.Generator) -> AntennaTrack:
     assert path.timestamps_s is not None
     covariances = np.tile(AUTONOMOUS_STDDEV_M**2 * np.eye(3), (len(path), 1, 1))
     at_m = survey.true_centers_m + RECEIVERS["exif"].errors_m(path.timestamps_s, rng)
-    log = PositionLog(at_m, covariances, None, path.image_names, np.arange(len(path)))
+    log = PositionLog(at_m, covariances, ByPhoto(path.image_names), np.arange(len(path)))
     return AntennaTrack(log, np.zeros(3), None, RangesOptions())
 
 
@@ -140,8 +141,7 @@ def datum_off(surveyed: SurveyedPositions) -> SurveyedPositions:
 def clock_off(surveyed: SurveyedPositions, ahead_s: float = 1.0) -> SurveyedPositions:
     """Return the positions with times that are said to be the camera's, and are ahead of it."""
     assert surveyed.antenna is not None
-    assert surveyed.antenna.log.timestamp_s is not None
-    log = replace(surveyed.antenna.log, timestamp_s=surveyed.antenna.log.timestamp_s + ahead_s)
+    log = replace(surveyed.antenna.log, moments=ByTime(surveyed.antenna.log.moments.timestamp_s + ahead_s))
     return replace(surveyed, antenna=replace(surveyed.antenna, log=log, offset=TimeOffset.given(0.0)))
 
 

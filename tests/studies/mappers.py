@@ -41,6 +41,7 @@ from rangesfm.sfm.mapping import map_photos, mapping_options, read_mapped_models
 from rangesfm.sfm.photo_files import Photos
 from rangesfm.sfm.rigs import NO_RIGS
 from rangesfm.sfm.steps import Workspace
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, read_reference, write_reference
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
@@ -91,7 +92,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
     (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
     rows = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(rows))
-    write_reference(Reference(made.centers_m, image_names=tuple(made.timestamps_s)), folder / "reference.csv")
+    write_reference(Reference(made.centers_m, ByPhoto(tuple(made.timestamps_s))), folder / "reference.csv")
 
 
 def map_database(folder: Path, method: str, leaf_size: int) -> None:
@@ -134,7 +135,7 @@ def _own_cost() -> list[float]:
 def rmse_m(folder: Path, model: pycolmap.Reconstruction) -> float:
     """Return the RMSE of the keyframe centres after the best similarity, metres."""
     truth = read_reference(folder / "reference.csv")
-    place = dict(zip(truth.image_names or (), truth.positions_m, strict=True))
+    place = dict(zip(truth.moments.image_name, truth.positions_m, strict=True))
     images = [image for image in model.images.values() if image.has_pose]
     found = np.array([image.projection_center() for image in images])
     wanted = np.array([place[image.name] for image in images])

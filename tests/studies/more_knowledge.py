@@ -39,6 +39,7 @@ from rangesfm.progress import Journal, Progress
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -70,7 +71,7 @@ class Measured:
         rows = np.linspace(0, len(path) - 1, NUM_POSITIONS).round().astype(np.int64)
         at_m = true_m[rows] + POSITION_STDDEV_M * rng.standard_normal((len(rows), 3))
         stated_m2, names = np.tile(POSITION_STDDEV_M**2 * np.eye(3), (len(rows), 1, 1)), path.image_names
-        track = PositionLog(at_m, stated_m2, None, tuple(names[row] for row in rows), rows)
+        track = PositionLog(at_m, stated_m2, ByPhoto(tuple(names[row] for row in rows)), rows)
         taped = []
         for _ in range(NUM_LENGTHS):
             first, last = (int(rng.integers(len(path) // 4)), int(rng.integers(len(path) // 2, len(path))))

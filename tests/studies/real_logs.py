@@ -45,6 +45,7 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import RangesOptions, ScaleOptions
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, read_reference
 from rangesfm.util.geometry.similarity import rmse
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -109,7 +110,7 @@ def read_set(data: Path, described: dict[str, Any]) -> tuple[RangeLog, list[Anch
         ]
         times, first = np.unique([float(row["time_s"]) for row in rows(ranges)], return_index=True)
         places = np.array([[float(row[f"tag_pos_{a}"]) for a in "xyz"] for row in rows(ranges)])
-        reference = Reference(places[first], timestamps_s=times)
+        reference = Reference(places[first], ByTime(times))
     return read_ranges(ranges, anchor_ids=[anchor.anchor_id for anchor in anchors]), anchors, reference
 
 
@@ -119,8 +120,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def path_of(reference: Reference) -> Trajectory:
-    times = reference.timestamps_s
-    assert times is not None, "the truth is by time"
+    times = reference.moments.timestamp_s
     kept = [0]
     for i, at in enumerate(times):
         if at - times[kept[-1]] >= MIN_STEP_S:
@@ -163,13 +163,12 @@ def placed(
 
 def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLog, Trajectory, float]:
     """Keep the ranges within 50 ms of a pose, and refer to it by its name instead of the time."""
-    assert log.timestamp_s is not None
     assert path.timestamps_s is not None
     times = log.timestamp_s + offset_s
     nearest = np.abs(times[:, None] - path.timestamps_s).argmin(axis=1)
     near = np.abs(times - path.timestamps_s[nearest]) < 0.05
     names = tuple(path.image_names[k] for k in nearest[near])
-    return replace(log.subset(near), timestamp_s=None, image_name=names), replace(path, timestamps_s=None), 0.0
+    return replace(log.subset(near), moments=ByPhoto(names)), replace(path, timestamps_s=None), 0.0
 
 
 def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:

@@ -68,13 +68,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     model, truth = pycolmap.Reconstruction(asked.model), read_reference(asked.data / "groundtruth.csv")
-    assert truth.image_names is not None
     assert truth.world_from_cam is not None
     given = json.loads((asked.data / "camera.json").read_text(encoding="utf-8"))
     camera = pycolmap.Camera(
         model=given["camera_model"], width=given["width"], height=given["height"], params=given["params"]
     )
-    row_of = {name: row for row, name in enumerate(truth.image_names)}
+    row_of = {name: row for row, name in enumerate(truth.moments.image_name)}
     points, marks, true_m, ids = "", "", [], spread_points(model, asked.num_points, asked.seed)
     for number, point_id in enumerate(ids):
         seen = pixels_of(model, point_id)

@@ -39,6 +39,7 @@ from rangesfm.solver.posterior import ScaleUncertainty
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -90,7 +91,7 @@ def main() -> int:
 
     for seed in range(asked.num_seeds):
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(at_m.shape)
-        log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), at_s, (), np.arange(len(at_s)))
+        log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), ByTime(at_s), np.arange(len(at_s)))
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
         found = scale_by_positions(locate_antenna(find_antenna_offset(track, path), path), path, bending)
         told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)

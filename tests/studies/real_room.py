@@ -28,7 +28,6 @@ def real_room(folder: Path, model: Path, seed: int) -> MadeSurvey:
     trajectory, times, centers_m, rotations = path_and_truth(folder, model)
     log = read_ranges(folder / "uwb.csv")
     rows = np.arange(seed % EVERY, len(log), EVERY)
-    assert log.timestamp_s is not None
     time_s = log.timestamp_s[rows]
     inside = (time_s > times[0]) & (time_s < times[-1])
     rows, time_s = rows[inside], time_s[inside]
@@ -65,10 +64,9 @@ def path_and_truth(
         times_of = {row["image_name"]: float(row["timestamp_s"]) for row in csv.DictReader(file)}
     trajectory = trajectory_from_reconstruction(pycolmap.Reconstruction(model), times_of)
     reference = read_reference(folder / "groundtruth.csv")
-    assert reference.timestamps_s is not None
     assert reference.world_from_cam is not None
-    rotations = Slerp(reference.timestamps_s, Rotation.from_matrix(reference.world_from_cam))
-    return trajectory, reference.timestamps_s, reference.positions_m, rotations
+    rotations = Slerp(reference.moments.timestamp_s, Rotation.from_matrix(reference.world_from_cam))
+    return trajectory, reference.moments.timestamp_s, reference.positions_m, rotations
 
 
 def interpolated(

@@ -21,6 +21,7 @@ from rangesfm.errors import InputError
 from rangesfm.util.files.atomic import is_plain_name
 from rangesfm.util.files.contents import open_regular
 from rangesfm.util.files.text_tables import read_text
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import read_reference
 
 MAX_COORDINATE = 1e12
@@ -366,7 +367,8 @@ def model_of_trajectory(path: Path) -> pycolmap.Reconstruction:
     poses = read_reference(path)
     if poses.world_from_cam is None:
         raise InputError("has positions without rotations, expected timestamp tx ty tz qx qy qz qw", path)
-    names = poses.image_names or [f"{time:.6f}.png" for time in np.asarray(poses.timestamps_s).tolist()]
+    by_time = [f"{time:.6f}.png" for time in poses.moments.timestamp_s.tolist()]
+    names = poses.moments.image_name if isinstance(poses.moments, ByPhoto) else by_time
     model = pycolmap.Reconstruction()
     # Poses have no pixels; the camera is only there because a model has one.
     model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1000.0, 1000, 1000))

@@ -250,7 +250,7 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     reference = read_true_positions(path)
     known, positions, rotations = known_keyframes(base, reference)
     if len(known) == 0:
-        raise InputError(reference.why_nothing_is_known("keyframes", reference.keys_of(base)), path)
+        raise InputError(reference.why_nothing_is_known("keyframes", reference.moments_of(base)), path)
     trajectory = Trajectory(
         frame_ids=base.frame_ids[known],
         image_names=tuple(base.image_names[i] for i in known),

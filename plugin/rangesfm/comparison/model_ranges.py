@@ -64,7 +64,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     before, after, has_place = ranges.places_on(metric_path.image_names)
     rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
     # Times of the ranges by the clock of the camera, or names of photos where these have no times.
-    times = names = None
+    times, names = np.zeros(0), list[str]()
     if metric_path.timestamps_s is None:
         names = [metric_path.image_names[row] for row in before[rows]]
     else:

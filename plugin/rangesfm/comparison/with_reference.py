@@ -12,6 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
 from rangesfm.result.comparison_row import ComparisonRow, rmse_heading
 from rangesfm.util.files.text_tables import align_rows
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 from rangesfm.util.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -47,7 +48,7 @@ def compare(
     for name, path in paths.items():
         known, target, world_from_cam = known_keyframes(path, reference)
         if len(known) == 0:
-            raise InputError(reference.why_nothing_is_known("keyframes", reference.keys_of(path)))
+            raise InputError(reference.why_nothing_is_known("keyframes", reference.moments_of(path)))
         source = path.centers[known]
         in_frame = _in_frame(path, known, target, world_from_cam, frame)
         found = similarity_onto(source, target)
@@ -100,7 +101,7 @@ def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str) ->
     positions = _in_frame(path, known, target, world_from_cam, frame)
     if positions is None:
         return NO_REFERENCE
-    return Reference(positions, image_names=tuple(path.image_names[i] for i in known))
+    return Reference(positions, ByPhoto(tuple(path.image_names[i] for i in known)))
 
 
 def known_keyframes(path: Trajectory, reference: Reference) -> tuple[npt.NDArray[np.int64], Array, Array | None]:

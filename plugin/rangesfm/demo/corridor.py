@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices
 from rangesfm.demo.simulated_radio import CameraPath, simulate_ranges
 from rangesfm.demo.survey import RADIO, TAG_IN_CAM_M, DemoSurvey, simulate_phone, write_demo
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference
 
 NUM_PHOTOS = 96
@@ -75,7 +76,7 @@ def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: in
         "images.csv": "\n".join(["image_name,timestamp_s", *rows]) + "\n",
         "anchors.csv": f"anchor_id,x_m,y_m,z_m\nA1,{x:.3f},{y:.3f},{z:.3f}\n",
     }
-    reference = Reference(survey.centers_m, image_names=survey.image_names, world_from_cam=survey.world_from_cam)
+    reference = Reference(survey.centers_m, ByPhoto(survey.image_names), survey.world_from_cam)
     write_demo(survey, reference, _survey_file(num_photos, seed), files, partial(_take_photo, survey))
     return survey
 

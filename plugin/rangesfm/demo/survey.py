@@ -26,6 +26,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
 from rangesfm.util.files.output_folder import PRIVATE_NAME
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 
 # Rendered by tests/rendering/make_demo_photos.py.
@@ -114,7 +115,7 @@ def make_demo_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 
     survey = _plan(folder, num_photos, seed, imu)
     write_demo(
         survey,
-        Reference(survey.centers_m, image_names=survey.image_names),
+        Reference(survey.centers_m, ByPhoto(survey.image_names)),
         _survey_file(num_photos, seed),
         {"anchors.csv": _anchor_file(seed)},
         lambda number, path: shutil.copyfile(PHOTOS / survey.image_names[number], path),

@@ -26,6 +26,7 @@ from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.clock_times import are_seconds_since_1970
+from rangesfm.util.geometry.moments import ByPhoto
 
 SAME_PLACE_M = 0.01
 """Two anchors that are nearer to each other than this, metres, are in one place, which cannot be."""
@@ -358,9 +359,8 @@ def _at_one_moment(log: RangeLog, own: Indices) -> Iterator[_Triangles]:
     Args:
         own: (num_anchors,) index of each anchor of the log among the compared ones; -1 for an anchor not compared.
     """
-    names = np.array(log.image_name or (), dtype=str)
     # Ranges of different photos are not simultaneous, so photos get times that are far apart.
-    times_s = np.unique(names, return_inverse=True)[1] * 1e6 if log.timestamp_s is None else log.timestamp_s
+    times_s = log.moments.sort_keys * (1e6 if isinstance(log.moments, ByPhoto) else 1.0)
     rows = np.flatnonzero(log.kind == RangeKind.TAG_ANCHOR)
     rows = rows[np.lexsort((times_s[rows], log.tag_index[rows]))]
     for lag in range(1, len(log.anchor_ids)):

@@ -28,6 +28,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.source import is_source, open_source
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.clock_times import span_text
+from rangesfm.util.geometry.moments import ByPhoto
 
 # Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4
@@ -194,16 +195,16 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
 
 
 def _tell_of_times(run: SurveyRun, num_keyframes: int, checked: CheckedSurvey) -> None:
-    radio_s, times = run.inputs.log.timestamp_s, run.times
-    if times is not None and radio_s is None:
+    times, moments, num = run.times, run.inputs.log.moments, len(run.inputs.log)
+    if times is not None and isinstance(moments, ByPhoto):
         first_s, last_s = times.timestamps_s[[0, -1]]
         checked.facts.append(f"times: {num_keyframes} keyframes from {span_text(first_s, last_s)} ({times.source})")
         return
-    if times is None or radio_s is None:
-        why = "the ranges name their photos" if len(run.inputs.log) else "there are no ranges"
+    if times is None:
+        why = "the ranges name their photos" if num else "there are no ranges"
         checked.facts.append(f"times: none are needed for {num_keyframes} keyframes, {why}")
         return
-    photos_s, offset_s = times.timestamps_s, run.survey.ranges.time_offset_s
+    radio_s, photos_s, offset_s = moments.timestamp_s, times.timestamps_s, run.survey.ranges.time_offset_s
     checked.facts.append(
         f"times: {num_keyframes} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
         f"ranges from {span_text(radio_s.min(), radio_s.max())}"

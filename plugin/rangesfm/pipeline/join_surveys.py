@@ -179,8 +179,8 @@ def joined_log(surveys: Sequence[FinishedRun], use_anchors: Sequence[str]) -> tu
     log = RangeLog.from_arrays(
         [one.ranges.anchor_id[k] for one, k in of_each],
         np.concatenate([one.ranges.range_m[rows] for one, rows in parts]),
-        timestamp_s=np.concatenate([_camera_times_s(one)[rows] for one, rows in parts]) if has_times else None,
-        image_name=None if has_times else [_own(one.own_name, one.ranges.image_name[k]) for one, k in of_each],
+        timestamp_s=np.concatenate([_camera_times_s(one)[rows] for one, rows in parts]) if has_times else (),
+        image_name=() if has_times else [_own(one.own_name, one.ranges.image_name[k]) for one, k in of_each],
         tag_id=[_own(one.tag_ids, one.ranges.tag_id[k]) for one, k in of_each],
     )
     number = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])

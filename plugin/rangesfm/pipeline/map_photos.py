@@ -43,6 +43,7 @@ from rangesfm.survey.survey_reader import input_paths
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.files.folders import real_path
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -114,13 +115,13 @@ def with_times(run: SurveyRun, times: ImageTimes) -> SurveyRun:
 
     The warnings are of both clocks if no time offset is given.
     """
-    radio_s, options = run.inputs.log.timestamp_s, run.survey.ranges
-    if radio_s is not None:
+    log, options = run.inputs.log, run.survey.ranges
+    if isinstance(log.moments, ByTime):
         run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
-        at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
+        at_s, is_given = log.timestamp_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
         run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
         if not is_given:
-            run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
+            run.journal.warn(*notes_on_times(log.timestamp_s, times.timestamps_s))
     return replace(run, times=times)
 
 

@@ -10,6 +10,7 @@ import pycolmap
 from rangesfm.colmap.transform import without_photos
 from rangesfm.errors import InputError
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 
@@ -35,8 +36,8 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
     if num_without_time := num - len(trajectory):
         run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
     check_times(run, trajectory)
-    offset, radio_times_s = run.find_time_offset(trajectory), run.inputs.log.timestamp_s
-    offset_s = 0.0 if offset is None or radio_times_s is None else offset.at(radio_times_s)
+    offset = run.find_time_offset(trajectory)
+    offset_s = 0.0 if offset is None else offset.at(run.inputs.log.timestamp_s)
     paths = [PathOfModel("sparse/0", models[0], trajectory, run.ranges_on(trajectory, offset_s), offset)]
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):
@@ -59,9 +60,9 @@ def check_times(run: SurveyRun, path: Trajectory) -> None:
     """
     reference, offset_s = run.inputs.reference, run.survey.ranges.time_offset_s
     if len(reference) and not np.isfinite(reference.positions_at(path)[0]).any():
-        why = reference.why_nothing_is_known("keyframes", reference.keys_of(path))
+        why = reference.why_nothing_is_known("keyframes", reference.moments_of(path))
         raise InputError(why, run.survey.report.reference)
-    if run.inputs.log.image_name is not None or offset_s is not None:
+    if isinstance(run.inputs.log.moments, ByPhoto) or offset_s is not None:
         run.ranges_on(path, offset_s or 0.0)
 
 

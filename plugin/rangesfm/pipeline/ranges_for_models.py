@@ -16,6 +16,7 @@ from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.geometry.moments import ByPhoto
 
 
 def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path: Path) -> ModelRanges:
@@ -34,11 +35,10 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
     """
     survey = survey.changed({"images.model": model_path.absolute()})
     run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
-    times = {} if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
+    times = {} if isinstance(run.inputs.log.moments, ByPhoto) else times_of_model(survey, model, model_path).by_name()
     metric = map_of_model(run, model, refine=False)
     log = metric.observations.log
-    if log.timestamp_s is not None:
-        log = replace(log, timestamp_s=log.timestamp_s + metric.path.offset_s)
+    log = replace(log, moments=log.moments.later(metric.path.offset_s))
     anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
     scaled = metric.estimate.metric_from_sfm
     return ModelRanges(

@@ -313,8 +313,7 @@ def _tables_of_scale(estimate: ScaleEstimate, path: Trajectory) -> Iterator[Tabl
     centers, anchor_m = about(path.centers[0])
     table = two_candidate(centers, tags, anchor_m, range_m)
     seen, duplets = (rows[:0], np.zeros((0, 2))) if table is None else (rows[table.rows], table.duplets)
-    times = np.full(len(seen), np.nan) if log.timestamp_s is None else log.timestamp_s[seen]
-    yield ScaleCandidates(times, tuple(log.anchor_ids[k] for k in log.anchor_index[seen]), *duplets.T)
+    yield ScaleCandidates(log.timestamp_s[seen], tuple(log.anchor_ids[k] for k in log.anchor_index[seen]), *duplets.T)
     # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
     centers, anchor_m = about(path.centers.mean(axis=0) if estimate.frame == "site" else path.centers[0])
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
@@ -336,8 +335,8 @@ def ranges_as_used(found: MetricResult) -> RangesAsUsed:
     names = (*found.trajectory.image_names, "")
     tag_ids, anchor_ids = log.end_ids()
     return RangesAsUsed(
-        timestamp_s=unknown if log.timestamp_s is None else log.timestamp_s,
-        image_name=("",) * len(log) if log.image_name is None else log.image_name,
+        timestamp_s=log.timestamp_s,
+        image_name=log.image_name,
         anchor_id=tuple(anchor_ids),
         tag_id=tuple(tag_ids),
         range_m=log.range_m,

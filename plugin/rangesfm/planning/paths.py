@@ -10,6 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
 from rangesfm.measurements.positions.true_positions import read_true_positions
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
@@ -121,14 +122,12 @@ def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:
         InputError: the file has no times or no rotations, or is not valid.
     """
     recorded = read_true_positions(path)
-    if recorded.timestamps_s is None or recorded.world_from_cam is None:
+    if isinstance(recorded.moments, ByPhoto) or recorded.world_from_cam is None:
         raise InputError("has no times or no rotations, expected timestamp tx ty tz qx qy qz qw", path)
-    _, chosen = np.unique(
-        np.floor((recorded.timestamps_s - recorded.timestamps_s[0]) * photo_rate_hz), return_index=True
-    )
+    times = recorded.moments.timestamp_s
+    _, chosen = np.unique(np.floor((times - times[0]) * photo_rate_hz), return_index=True)
     _require_possible(len(chosen))
-    times = recorded.timestamps_s[chosen]
-    return _trajectory(times - times[0], recorded.positions_m[chosen], recorded.world_from_cam[chosen])
+    return _trajectory(times[chosen] - times[0], recorded.positions_m[chosen], recorded.world_from_cam[chosen])
 
 
 def path_from_model(path: Path, photo_rate_hz: float) -> Trajectory:

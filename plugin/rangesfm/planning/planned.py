@@ -29,6 +29,7 @@ from rangesfm.options import RangeModelOptions, RangesOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -59,7 +60,7 @@ class PlannedAntenna(Options, table="positions"):
         times_s = np.arange(path.timestamps_s[0], path.timestamps_s[-1], 1 / self.rate_hz)
         covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
         nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
-        log = PositionLog(nowhere, covariance_m2, times_s, (), lines)
+        log = PositionLog(nowhere, covariance_m2, ByTime(times_s), lines)
         found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), None, RangesOptions()), path)
         return replace(found, position_m=found.predicted_m(IDENTITY))
 

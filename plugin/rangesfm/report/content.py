@@ -98,7 +98,7 @@ class Content:
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
         self.reference_m = reference.positions_m
-        self.reference_by_photo = dict(zip(reference.image_names or (), self.reference_m))
+        self.reference_by_photo = dict(zip(reference.moments.image_name, self.reference_m))
 
     @cached_property
     def true_scale(self) -> Trajectory:

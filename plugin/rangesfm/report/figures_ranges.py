@@ -28,6 +28,7 @@ from rangesfm.report.plot import (
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.folders import natural_order
+from rangesfm.util.geometry.moments import ByPhoto
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48
@@ -170,14 +171,14 @@ def plot_ranges(log: RangeLog) -> Figure:
 
     Where the log names photos in place of times, the horizontal axis is the number of the range.
     """
-    times = log.timestamp_s
-    x = np.arange(len(log)) if times is None else times - times.min()
+    is_by_photo, first_s = isinstance(log.moments, ByPhoto), log.timestamp_s.min()
+    x = np.arange(len(log)) if is_by_photo else log.timestamp_s - first_s
     series = []
     for i, anchor_id in enumerate(log.anchor_ids):
         hue = colorsys.hsv_to_rgb(i / len(log.anchor_ids), 0.8, 0.75)
         color = "#" + "".join(f"{round(255 * part):02x}" for part in hue)
         series.append(Series(anchor_id, color, np.column_stack([x, log.range_m])[log.anchor_index == i]))
-    label = "range" if times is None else f"s since {time_text(times.min())}"
+    label = "range" if is_by_photo else f"s since {time_text(first_s)}"
     y_range = (0.0, 1.05 * float(log.range_m.max()))
     return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
 

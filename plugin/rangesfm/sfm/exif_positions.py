@@ -15,6 +15,7 @@ from rangesfm.measurements.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
 from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.photo_files import GpsData, gps_data
+from rangesfm.util.geometry.moments import ByPhoto
 
 _STATUS, _VOID, _DILUTION, _HORIZONTAL_ERROR = 9, "V", 11, 31
 # A horizontal error is said as the radius within which 68 % of the positions are: 1.51 standard deviations of a
@@ -48,8 +49,8 @@ def read_exif_positions(folder: Path) -> PositionLog:
         folder,
         "exif",
         np.array([*at.values()]),
+        ByPhoto(tuple(at)),
         np.zeros(len(at), dtype=np.int64),
-        image_name=[*at],
         covariance_m2=stddevs_m[:, :, None] ** 2 * np.eye(3),
         notes=[flat] if len(at) < len(found) else [],
     )

@@ -32,6 +32,7 @@ from rangesfm.sfm.exif_positions import read_exif_positions
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.folders import natural_order
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
@@ -77,7 +78,7 @@ class RangingInputs:
     @property
     def needs_times(self) -> bool:
         """True if the photos' times are needed, for ranges or positions by time, or for an inertial sensor."""
-        return self.log.image_name is None or self.positions.needs_times or self.imu is not None
+        return isinstance(self.log.moments, ByTime) or self.positions.needs_times or self.imu is not None
 
     @property
     def may_be_left_out(self) -> bool:
@@ -89,10 +90,10 @@ class RangingInputs:
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
         for markers in filter(None, [points.markers or tape.markers]):
             yield f"marks in {_name(next(iter(markers.values())).path)}", _photos_of(markers)
-        if antenna is not None and antenna.log.image_name:
-            yield f"positions in {_name(antenna.log.path)}", antenna.log.image_name
-        if self.log.image_name is not None:
-            yield f"ranges in {_name(self.log.source)}", self.log.image_name
+        if antenna is not None and isinstance(antenna.log.moments, ByPhoto):
+            yield f"positions in {_name(antenna.log.path)}", antenna.log.moments.image_name
+        if isinstance(self.log.moments, ByPhoto):
+            yield f"ranges in {_name(self.log.source)}", self.log.moments.image_name
 
     def with_photos(self, photos: Collection[str]) -> RangingInputs:
         """Return the inputs with the photos of marks named as these are."""
@@ -167,7 +168,7 @@ def _read_radio(survey: Survey) -> tuple[RangeLog, tuple[Anchor, ...], tuple[str
         listed, anchor_notes = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
     tag_ids = [*survey.tag.lever_arms_m, *([survey.tag.tag_id] if survey.tag.tag_id else [])]
     if survey.ranges.path is None:
-        log = RangeLog.from_arrays([], [], image_name=[])
+        log = RangeLog.from_arrays([], [])
     else:
         ids = [anchor.anchor_id for anchor in listed]
         log = read_log(survey.ranges, ids, tag_ids)
@@ -334,7 +335,7 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], survey: Sur
     nowhere = np.full(3, np.nan)
     position_m = np.array([known.get(anchor_id, nowhere) for anchor_id in log.anchor_ids]).reshape(-1, 3)
     of_camera = np.flatnonzero((log.anchor_index >= 0) & (log.peer_index < 0))
-    if log.timestamp_s is None or len(of_camera) < 2:
+    if isinstance(log.moments, ByPhoto) or len(of_camera) < 2:
         return
     order = of_camera[np.argsort(log.timestamp_s[of_camera], kind="stable")]
     first, second = order[:-1], order[1:]

@@ -28,6 +28,7 @@ from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.files.photo_names import told_none, told_unknown
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 
@@ -51,8 +52,7 @@ class PathOfModel:
     @property
     def offset_s(self) -> float | Array:
         """Image time minus time of the log: (n,) for its ranges, or 0 where it names photos."""
-        times_s = self.observations.log.timestamp_s
-        return 0.0 if self.time_offset is None or times_s is None else self.time_offset.at(times_s)
+        return 0.0 if self.time_offset is None else self.time_offset.at(self.observations.log.timestamp_s)
 
     @property
     def as_walk(self) -> WalkBending:
@@ -102,7 +102,7 @@ class SurveyRun:
         inputs, survey = self.inputs, self.survey
         if survey.ranges.time_offset_s is not None:
             return TimeOffset.given(survey.ranges.time_offset_s)
-        if inputs.log.image_name is not None:
+        if isinstance(inputs.log.moments, ByPhoto):
             return None
         with self.journal.stage("time offset"):
             offset = estimate_time_offset(
@@ -155,9 +155,10 @@ class SurveyRun:
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
-    times, photo_times = placed.log.timestamp_s, trajectory.timestamps_s
-    if times is None or photo_times is None:
-        return told_none("the log", placed.log.image_name or ("",), trajectory.image_names)
+    moments, photo_times = placed.log.moments, trajectory.timestamps_s
+    if isinstance(moments, ByPhoto) or photo_times is None:
+        return told_none("the log", moments.image_name, trajectory.image_names)
+    times = moments.timestamp_s
     if np.all(placed.status[placed.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
         return (
             f"the log's times ({span_text(times.min(), times.max())}, plus an offset of {offset_s:g} s) do not "

@@ -62,7 +62,6 @@ class Survey:
     @property
     def distance_m(self) -> Array:
         """The true distance of each range in the log."""
-        assert self.log.timestamp_s is not None
         keyframe = np.searchsorted(self.times, self.log.timestamp_s)
         anchors = np.array([self.anchors_m[name] for name in self.log.anchor_ids])[self.log.anchor_index]
         tags = self.centers_m[keyframe] + self.world_from_cam[keyframe] @ self.tag_in_cam_m

@@ -43,7 +43,6 @@ class Rigid:
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
     """(n,) errors of each anchor that come and go over some seconds."""
     log = survey.log
-    assert log.timestamp_s is not None
     rng = np.random.default_rng(seed)
     errors = np.zeros(len(log))
     for k in range(len(log.anchor_ids)):

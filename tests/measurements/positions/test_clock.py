@@ -16,6 +16,7 @@ from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -58,7 +59,7 @@ def track(places: Places, times_s: Array, num_wrong: int = 0, offset_s: float | 
     rng = np.random.default_rng(1)
     at_m = places(times_s) + [1012.0, 5003.0, 413.0] + NOISE_M * rng.standard_normal((len(times_s), 3))
     at_m[rng.permutation(len(at_m))[:num_wrong]] += rng.normal(0.0, 20.0, (num_wrong, 3))
-    log = PositionLog(at_m, np.full((len(at_m), 3, 3), np.nan), times_s + AHEAD_S, (), np.arange(len(at_m)))
+    log = PositionLog(at_m, np.full((len(at_m), 3, 3), np.nan), ByTime(times_s + AHEAD_S), np.arange(len(at_m)))
     offset = None if offset_s is None else TimeOffset.given(offset_s)
     return AntennaTrack(log, np.zeros(3), offset, RangesOptions())
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from tests.known import known
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_formats import read_positions
@@ -38,8 +37,7 @@ def nmea(*bodies: str) -> str:
 
 def test_the_canonical_table_is_read_in_the_order_of_time(tmp_path: Path) -> None:
     found = read(tmp_path, "timestamp_s,x_m,y_m,z_m,stddev_m\n2,4,5,6,0.1\n1,1,2,3,0.2\n2,9,9,9,0.1\n")
-    assert found.timestamp_s is not None
-    np.testing.assert_array_equal(found.timestamp_s, [1, 2])
+    np.testing.assert_array_equal(found.moments.timestamp_s, [1, 2])
     np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(found.covariance_m2, [0.04 * np.eye(3), 0.01 * np.eye(3)])
     np.testing.assert_array_equal(found.line, [3, 2])
@@ -49,7 +47,7 @@ def test_the_canonical_table_is_read_in_the_order_of_time(tmp_path: Path) -> Non
 def test_positions_by_photo_may_have_a_covariance(tmp_path: Path) -> None:
     names = "image_name,x_m,y_m,z_m,cov_xx_m2,cov_xy_m2,cov_xz_m2,cov_yy_m2,cov_yz_m2,cov_zz_m2"
     found = read(tmp_path, f"{names}\na.jpg,1,2,3,4,1,0,5,0,6\nb.jpg,1,2,3,,,,,,\n")
-    assert found.image_name == ("a.jpg", "b.jpg")
+    assert found.moments.image_name == ("a.jpg", "b.jpg")
     np.testing.assert_array_equal(found.covariance_m2[0], [[4, 1, 0], [1, 5, 0], [0, 0, 6]])
     assert np.isnan(found.covariance_m2[1]).all()
 
@@ -57,8 +55,7 @@ def test_positions_by_photo_may_have_a_covariance(tmp_path: Path) -> None:
 def test_a_table_of_a_positioning_system_is_recognised_by_its_columns(tmp_path: Path) -> None:
     rows = "".join(f"{1000 * k},T1,{100 * k},{200 * k},{5 * k}\n" for k in range(30))
     found = read(tmp_path, f"timestamp (ms),tag_id,pos_x (mm),pos_y (mm),pos_z (mm)\n{rows}")
-    assert found.timestamp_s is not None
-    np.testing.assert_allclose(found.timestamp_s, np.arange(30.0))
+    np.testing.assert_allclose(found.moments.timestamp_s, np.arange(30.0))
     np.testing.assert_allclose(found.position_m[2], [0.2, 0.4, 0.01])
     with pytest.raises(InputError, match=r"has positions of several tags \(T1, T2\): say which it is"):
         read(tmp_path, "timestamp_s,tag_id,x,y,z\n1,T1,1,2,3\n2,T2,1,2,3\n")
@@ -82,8 +79,7 @@ def test_nmea_gives_ellipsoidal_heights_utc_and_stddevs(tmp_path: Path) -> None:
     )
     found = read(tmp_path, f"{text}$GPGGA,000003.00,broken*00\n")
     assert (found.format, found.crs) == ("nmea", GEOGRAPHIC)
-    assert found.timestamp_s is not None
-    np.testing.assert_allclose(found.timestamp_s, [DAY_S - 1, DAY_S + 1.5])
+    np.testing.assert_allclose(found.moments.timestamp_s, [DAY_S - 1, DAY_S + 1.5])
     np.testing.assert_allclose(found.position_m[0], [8 + 33.9159 / 60, 47 + 17.11399 / 60, 547.6])
     assert found.position_m[1, 0] < 0
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance_m2[0])), [0.03, 0.02, 0.05])
@@ -98,8 +94,7 @@ def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> N
     row = "2024/03/01 00:00:05.500 47.06 -1.35 84.8 1 9 0.02 0.01 0.05 -0.01 0.002 0.003 0.0"
     found = read(tmp_path, f"% program : RTKLIB\n{names}\n{row}\n")
     assert (found.format, found.crs) == ("rtklib", GEOGRAPHIC)
-    assert found.timestamp_s is not None
-    np.testing.assert_allclose(found.timestamp_s, [DAY_S + 5.5])
+    np.testing.assert_allclose(found.moments.timestamp_s, [DAY_S + 5.5])
     np.testing.assert_allclose(found.position_m, [[-1.35, 47.06, 84.8]])
     np.testing.assert_allclose(
         found.covariance_m2[0], [[1e-4, -1e-4, 4e-6], [-1e-4, 4e-4, 9e-6], [4e-6, 9e-6, 25e-4]], atol=1e-12
@@ -113,8 +108,7 @@ def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{1700000000000 + 100 * k},100,{100 * k},5,1.0{k},2.0,0.5,1,3.2,2,4.1\n" for k in range(3))
     found = read(tmp_path, rows)
     assert found.format == "marvelmind"
-    assert found.timestamp_s is not None
-    np.testing.assert_allclose(np.diff(found.timestamp_s), 0.1, atol=1e-6)
+    np.testing.assert_allclose(np.diff(found.moments.timestamp_s), 0.1, atol=1e-6)
     np.testing.assert_allclose(found.position_m[:, 0], [1.0, 1.01, 1.02])
 
 
@@ -138,7 +132,7 @@ def test_pose_priors_of_a_database_are_positions_of_its_photos(tmp_path: Path, s
     before = path.read_bytes()
     found = read_positions(PositionOptions().changed(path=path))
     assert found is not None
-    assert found.image_name == ("0.jpg", "1.jpg", "2.jpg")
+    assert found.moments.image_name == ("0.jpg", "1.jpg", "2.jpg")
     is_geographic = system == "WGS84"
     assert found.crs == (GEOGRAPHIC if is_geographic else "")
     np.testing.assert_array_equal(found.position_m[1], [8, 48, 400] if is_geographic else [48, 8, 400])
@@ -199,11 +193,11 @@ def test_trajectories_of_other_programs_give_their_positions(tmp_path: Path, nam
     rows = [row.format(k=k, t=t, s=f"{t / 1e9:.6f}", x=x, y=y, z=z) for k, (t, x, y, z) in enumerate(ROWS)]
     path = tmp_path / "positions.txt"
     found = read(tmp_path, "\n".join([header] * bool(header) + rows) + "\n")
-    np.testing.assert_allclose(known(found.timestamp_s), [t / 1e9 for t, *_ in ROWS], atol=1e-6)
+    np.testing.assert_allclose(found.moments.timestamp_s, [t / 1e9 for t, *_ in ROWS], atol=1e-6)
     np.testing.assert_array_equal(found.position_m, [place for _, *place in ROWS])
     reference = read_true_positions(path)
     np.testing.assert_array_equal(reference.positions_m, found.position_m)
-    np.testing.assert_array_equal(known(reference.timestamps_s), known(found.timestamp_s))
+    np.testing.assert_array_equal(reference.moments.timestamp_s, found.moments.timestamp_s)
 
 
 PHOTOS = [f"DJI_{k:04}.JPG" for k in range(5)]
@@ -238,7 +232,7 @@ def by_photo(row: str) -> str:
 def test_positions_of_photos_keep_their_coordinate_system(tmp_path: Path, text: str, crs: str) -> None:
     found = read(tmp_path, text)
     assert found.crs == crs
-    assert [name[:8] for name in known(found.image_name)] == [photo[:8] for photo in PHOTOS]
+    assert [name[:8] for name in found.moments.image_name] == [photo[:8] for photo in PHOTOS]
     np.testing.assert_array_equal(found.position_m, PLACES)
     if "0.02" in text:
         np.testing.assert_allclose(found.covariance_m2, np.tile(np.diag([4e-4, 4e-4, 16e-4]), (5, 1, 1)))
@@ -258,7 +252,7 @@ def test_degrees_of_photos_are_read_as_programs_write_them(
 ) -> None:
     row = f"./a.jpg,{latitude},{longitude},{height}\n"
     found = read(tmp_path, "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n" + row + row.replace("a.jpg", "b.jpg"))
-    assert (found.crs, found.image_name) == (GEOGRAPHIC, ("./a.jpg", "./b.jpg"))
+    assert (found.crs, found.moments.image_name) == (GEOGRAPHIC, ("./a.jpg", "./b.jpg"))
     np.testing.assert_allclose(found.position_m, 2 * [[8.5076, 49.0398, 415.2]], atol=1e-9)
 
 
@@ -316,7 +310,7 @@ def test_rows_without_a_fix_are_counted_and_left_out(tmp_path: Path, header: str
     more = ",4" * (header.count(",") - 3)
     rows = [f"{k}.0,{8 + 1e-5 * k},{47 + 1e-5 * k},3{more}" if k != 2 else lost for k in range(6)]
     found = read(tmp_path, "\n".join([header, *rows]) + "\n")
-    assert known(found.timestamp_s).tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
+    assert found.moments.timestamp_s.tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
     assert np.isfinite(found.position_m).all()
     assert "positions.txt: 1 of 6 rows have no position (no fix) and are left out" in found.notes
 
@@ -328,7 +322,7 @@ def test_a_true_trajectory_may_have_gaps(tmp_path: Path) -> None:
     ):
         (tmp_path / name).write_text(text)
         found = read_true_positions(tmp_path / name)
-        assert known(found.timestamps_s).tolist() == [0.0, 2.0]
+        assert found.moments.timestamp_s.tolist() == [0.0, 2.0]
         assert found.notes == (f"{name}: 1 of 3 rows have no position and are left out",)
 
 

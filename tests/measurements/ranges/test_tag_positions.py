@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.known_path import tag_positions
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference
 
 TIMES_S = np.array([0.0, 0.4, 0.8, 2.0, 2.4])
@@ -26,26 +27,26 @@ def log_of(*names: str) -> RangeLog:
 
 def test_is_interpolated_at_the_time_of_the_range_plus_the_offset() -> None:
     found = tag_positions(
-        log_at([-9.9, -9.3, -7.8]), Reference(PATH_M, timestamps_s=TIMES_S), time_offset_s=10.0, max_gap_s=0.5
+        log_at([-9.9, -9.3, -7.8]), Reference(PATH_M, ByTime(TIMES_S)), time_offset_s=10.0, max_gap_s=0.5
     )
     np.testing.assert_allclose(found, np.outer([0.1, 0.7, 2.2], [1.0, 0.0, -0.5]), atol=1e-12)
 
 
 def test_is_unknown_in_gaps_and_beyond_the_ends() -> None:
-    found = tag_positions(log_at([-0.1, 0.2, 1.4, 2.5]), Reference(PATH_M, timestamps_s=TIMES_S), max_gap_s=0.5)
+    found = tag_positions(log_at([-0.1, 0.2, 1.4, 2.5]), Reference(PATH_M, ByTime(TIMES_S)), max_gap_s=0.5)
     assert np.isfinite(found[:, 0]).tolist() == [False, True, False, False]
 
 
 def test_turns_the_lever_arm_with_the_camera() -> None:
     turns = Rotation.from_rotvec(np.outer(TIMES_S, [0.0, 0.0, 1.0])).as_matrix()
-    path = Reference(PATH_M, timestamps_s=TIMES_S, world_from_cam=turns)
+    path = Reference(PATH_M, ByTime(TIMES_S), world_from_cam=turns)
     found = tag_positions(log_at([0.6]), path, (0.1, 0.0, -0.2), max_gap_s=0.5)
     expected = np.array([0.6 + 0.1 * np.cos(0.6), 0.1 * np.sin(0.6), -0.3 - 0.2])
     np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
 def test_is_found_by_name() -> None:
-    path = Reference(PATH_M[:2], image_names=("p1", "p2"))
+    path = Reference(PATH_M[:2], ByPhoto(("p1", "p2")))
     found = tag_positions(log_of("p2", "p9"), path, max_gap_s=0.5)
     np.testing.assert_array_equal(found, [PATH_M[1], np.full(3, np.nan)])
 
@@ -53,12 +54,12 @@ def test_is_found_by_name() -> None:
 @pytest.mark.parametrize(
     ("log", "path", "said"),
     [
-        (log_of("p1"), Reference(PATH_M, timestamps_s=TIMES_S), "ranges are by name and the positions by time"),
-        (log_at([0.0]), Reference(PATH_M[:1], image_names=("p1",)), "ranges are by time and the positions by name"),
-        (log_of("a"), Reference(PATH_M[:1], image_names=("b",)), "of photo 'b', the first of the ranges of photo 'a'"),
+        (log_of("p1"), Reference(PATH_M, ByTime(TIMES_S)), "ranges are by name and the positions by time"),
+        (log_at([0.0]), Reference(PATH_M[:1], ByPhoto(("p1",))), "ranges are by time and the positions by name"),
+        (log_of("a"), Reference(PATH_M[:1], ByPhoto(("b",))), "of photo 'b', the first of the ranges of photo 'a'"),
         (
             log_at([7.0, 9.0]),
-            Reference(PATH_M, timestamps_s=TIMES_S),
+            Reference(PATH_M, ByTime(TIMES_S)),
             "positions are known from 0.000 to 2.400 s, .* the ranges are from 7.000 to 9.000 s",
         ),
     ],
@@ -71,4 +72,4 @@ def test_says_why_it_is_known_nowhere(log: RangeLog, path: Reference, said: str)
 
 def test_lever_arm_needs_rotations() -> None:
     with pytest.raises(InputError, match="a lever arm needs the rotations qx,qy,qz,qw"):
-        tag_positions(log_at([0.1]), Reference(PATH_M, timestamps_s=TIMES_S), (0.1, 0.0, 0.0), max_gap_s=0.5)
+        tag_positions(log_at([0.1]), Reference(PATH_M, ByTime(TIMES_S)), (0.1, 0.0, 0.0), max_gap_s=0.5)

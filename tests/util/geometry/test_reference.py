@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import Reference, read_reference, write_reference
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -46,8 +47,7 @@ def test_orientations_are_world_from_camera_with_the_scalar_last(tmp_path: Path)
 
 def test_times_in_any_order_are_sorted(tmp_path: Path) -> None:
     reference = read_reference(write(tmp_path / "r.csv", "timestamp_s,x_m,y_m,z_m\n2,20,0,0\n1,10,0,0\n"))
-    assert reference.timestamps_s is not None
-    np.testing.assert_array_equal(reference.timestamps_s, [1, 2])
+    np.testing.assert_array_equal(reference.moments.timestamp_s, [1, 2])
     np.testing.assert_array_equal(reference.positions_m[:, 0], [10, 20])
 
 
@@ -59,16 +59,14 @@ def test_the_first_pose_of_each_time_counts(tmp_path: Path) -> None:
 
 def test_nanoseconds_in_a_tum_file_are_seconds(tmp_path: Path) -> None:
     reference = read_reference(write(tmp_path / "r.txt", "1403636579763555584.000000 1 2 3 0 0 0 1\n"))
-    assert reference.timestamps_s is not None
-    assert reference.timestamps_s[0] == pytest.approx(1403636579.763555584, abs=1e-6)
+    assert reference.moments.timestamp_s[0] == pytest.approx(1403636579.763555584, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", ["truth.tum", "truth.txt"])
 def test_a_tum_file_is_recognised_with_and_without_its_suffix(tmp_path: Path, name: str) -> None:
     reference = read_reference(write(tmp_path / name, "# timestamp tx ty tz qx qy qz qw\n5.5 1 2 3 0 0 0 1\n"))
-    assert reference.timestamps_s is not None
     assert reference.world_from_cam is not None
-    assert reference.timestamps_s[0] == 5.5
+    assert reference.moments.timestamp_s[0] == 5.5
     np.testing.assert_array_equal(reference.positions_m, [[1, 2, 3]])
     np.testing.assert_array_equal(reference.world_from_cam[0], np.eye(3))
 
@@ -76,7 +74,7 @@ def test_a_tum_file_is_recognised_with_and_without_its_suffix(tmp_path: Path, na
 def test_poses_between_samples_are_interpolated() -> None:
     quarter_turn = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_matrix()
     reference = Reference(
-        np.array([[0.0, 0, 0], [4, 8, 0]]), timestamps_s=np.array([10.0, 10.04]), world_from_cam=quarter_turn
+        np.array([[0.0, 0, 0], [4, 8, 0]]), ByTime(np.array([10.0, 10.04])), world_from_cam=quarter_turn
     )
     positions, rotations = reference.positions_at(path_at([10.03]))
     np.testing.assert_allclose(positions, [[3, 6, 0]])
@@ -85,7 +83,7 @@ def test_poses_between_samples_are_interpolated() -> None:
 
 
 def test_nothing_is_interpolated_across_a_gap() -> None:
-    reference = Reference(np.array([[0.0, 0, 0], [1, 0, 0]]), timestamps_s=np.array([0.0, 0.06]))
+    reference = Reference(np.array([[0.0, 0, 0], [1, 0, 0]]), ByTime(np.array([0.0, 0.06])))
     trajectory = path_at([0.004, 0.03, 0.058])
     positions, _ = reference.positions_at(trajectory)
     np.testing.assert_array_equal(positions[:, 0], [0, np.nan, 1])
@@ -93,18 +91,18 @@ def test_nothing_is_interpolated_across_a_gap() -> None:
 
 
 def test_outside_its_samples_a_reference_knows_nothing() -> None:
-    reference = Reference(np.array([[0.0, 0, 0], [1, 0, 0]]), timestamps_s=np.array([0.0, 0.02]))
+    reference = Reference(np.array([[0.0, 0, 0], [1, 0, 0]]), ByTime(np.array([0.0, 0.02])))
     positions, _ = reference.positions_at(path_at([-1.0, -0.005, 0.025, 1.0]))
     np.testing.assert_array_equal(positions[:, 0], [np.nan, 0, 1, np.nan])
 
 
 def test_a_single_sample_is_enough() -> None:
-    positions, _ = Reference(np.array([[7.0, 0, 0]]), timestamps_s=np.array([3.0])).positions_at(path_at([3.0, 4.0]))
+    positions, _ = Reference(np.array([[7.0, 0, 0]]), ByTime(np.array([3.0]))).positions_at(path_at([3.0, 4.0]))
     np.testing.assert_array_equal(positions[:, 0], [7, np.nan])
 
 
 def test_a_reference_by_time_needs_photos_with_times() -> None:
-    reference = Reference(np.zeros((1, 3)), timestamps_s=np.array([0.0]))
+    reference = Reference(np.zeros((1, 3)), ByTime(np.array([0.0])))
     with pytest.raises(InputError, match="photos have no times"):
         reference.positions_at(path_at(names=("a.jpg",)))
 
@@ -135,25 +133,24 @@ def test_a_missing_file_is_an_input_error(tmp_path: Path) -> None:
         read_reference(tmp_path / "reference.csv")
 
 
-@pytest.mark.parametrize("is_by_image", [True, False])
-def test_what_is_written_is_read_back(tmp_path: Path, is_by_image: bool) -> None:
+@pytest.mark.parametrize(
+    "moments",
+    [ByPhoto(("a,b.jpg", 'say "c".jpg', "d e.jpg", "f.jpg")), ByTime(np.array([1.0, 2.5, 3.25, 1e9]))],
+)
+def test_what_is_written_is_read_back(tmp_path: Path, moments: Moments) -> None:
     rng = np.random.default_rng(1)
     written = Reference(
         rng.normal(size=(4, 3)),
-        image_names=("a,b.jpg", 'say "c".jpg', "d e.jpg", "f.jpg") if is_by_image else None,
-        timestamps_s=None if is_by_image else np.array([1.0, 2.5, 3.25, 1e9]),
-        world_from_cam=Rotation.random(4, random_state=1).as_matrix(),
+        moments,
+        Rotation.random(4, random_state=1).as_matrix(),
     )
     read = read_reference(write_reference(written, tmp_path / "reference.csv"))
-    assert read.image_names == written.image_names
+    assert read.moments.image_name == moments.image_name
+    np.testing.assert_array_equal(read.moments.timestamp_s, moments.timestamp_s)
     np.testing.assert_allclose(read.positions_m, written.positions_m, atol=1e-9)
     assert read.world_from_cam is not None
     assert written.world_from_cam is not None
     np.testing.assert_allclose(read.world_from_cam, written.world_from_cam, atol=1e-8)
-    if not is_by_image:
-        assert read.timestamps_s is not None
-        assert written.timestamps_s is not None
-        np.testing.assert_array_equal(read.timestamps_s, written.timestamps_s)
 
 
 def test_numbers_too_large_to_be_squared_are_refused_without_a_warning(tmp_path: Path) -> None:
@@ -167,6 +164,6 @@ def test_a_gap_of_the_limit_is_none_whatever_the_date() -> None:
     """Seconds since 1970 have steps of 2.4e-7 s, so samples every 0.1 s are sometimes slightly further apart."""
     times = 1.7e9 + 0.1 * np.arange(20, dtype=np.float64)
     assert np.ptp(np.diff(times)) > 0
-    reference = Reference(np.arange(60.0).reshape(20, 3), timestamps_s=times)
-    positions, _ = reference.poses(times[:-1] + 0.05, max_gap_s=0.1)
+    reference = Reference(np.arange(60.0).reshape(20, 3), ByTime(times))
+    positions, _ = reference.poses(ByTime(times[:-1] + 0.05), max_gap_s=0.1)
     np.testing.assert_allclose(positions, np.arange(57.0).reshape(19, 3) + 1.5, atol=1e-4)

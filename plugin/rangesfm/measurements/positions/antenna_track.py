@@ -17,6 +17,7 @@ from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.photo_names import rows_of_photos
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around
 
@@ -49,6 +50,11 @@ class AntennaTrack:
         """Standard deviation of the offset; 0 where it was given."""
         return 0.0 if self.offset is None else self.offset.stddev_s
 
+    @property
+    def image_times_s(self) -> Array:
+        """(n,) times of the positions on the photos' clock; NaN for positions by photo."""
+        return self.log.moments.later(self.offset_s).timestamp_s
+
 
 def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     """Return the positions that have a place on a path; the others are left out."""
@@ -62,8 +68,9 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     else:
         at_keyframes = np.gradient(path.centers, times_s, axis=0, edge_order=2 if len(path) > 2 else 1)
         velocity = (1 - fraction)[:, None] * at_keyframes[before] + fraction[:, None] * at_keyframes[after]
-        at_s = times_s[before] if track.log.timestamp_s is None else _times_s(track)[rows]
-    names = _names(track)
+        at_s = times_s[before] if isinstance(track.log.moments, ByPhoto) else track.image_times_s[rows]
+    moments = track.log.moments
+    names = moments.image_name if isinstance(moments, ByPhoto) else [*map(time_text, moments.timestamp_s.tolist())]
     interval_s = np.zeros(k) if times_s is None else times_s[after] - times_s[before]
     places = AntennaPlaces(before, after, fraction, interval_s, on_path.offsets)
     parts = places.by_pose(Poses(path.world_from_cam, path.centers), arms_m, np.tile(np.eye(3), (k, 1, 1)))
@@ -89,27 +96,16 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     )
 
 
-def _times_s(track: AntennaTrack) -> Array:
-    assert track.log.timestamp_s is not None, "positions by time"
-    return track.log.timestamp_s + track.offset_s
-
-
-def _names(track: AntennaTrack) -> list[str]:
-    if track.log.timestamp_s is None:
-        return [*track.log.image_name]
-    return [time_text(time_s) for time_s in track.log.timestamp_s.tolist()]
-
-
 def _places(track: AntennaTrack, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
     """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
     log, options = track.log, track.association
-    if log.timestamp_s is None:
-        at = rows_of_photos(log.image_name, path.image_names)
+    if isinstance(log.moments, ByPhoto):
+        at = rows_of_photos(log.moments.image_name, path.image_names)
         rows = np.flatnonzero(at >= 0)
         return rows, at[rows], at[rows], np.zeros(len(rows))
     if path.timestamps_s is None:
         raise InputError("the positions have times but the photos have none: give image times", log.path)
-    times, known = _times_s(track), path.timestamps_s
+    times, known = track.image_times_s, path.timestamps_s
     before, after, fraction, nearest = keyframes_around(times, known)
     gap = known[after] - known[before]
     is_between: Mask = (times >= known[0]) & (times <= known[-1]) & (gap > 0) & ~is_too_long(gap, options)

@@ -18,6 +18,7 @@ from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stdde
 from rangesfm.measurements.ranges.clock.time_offset import offset_of_motion, path_to_search, require_enough
 from rangesfm.progress import SILENT
 from rangesfm.util.files.photo_names import rows_of_photos, told_none
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import align_points, rounding_of, similarity_motions
@@ -118,14 +119,15 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         InputError: the positions are by time and the photos have none, or they are of other photos.
         GeometryError: the motion does not determine the offset.
     """
-    if track.log.timestamp_s is None:
-        listed = track.log.image_name
+    moments = track.log.moments
+    if isinstance(moments, ByPhoto):
+        listed = moments.image_name
         if np.all(rows_of_photos(listed, path.image_names) < 0):
             raise InputError(told_none("the file", listed, path.image_names), track.log.path)
         return track
     if path.timestamps_s is None:
         raise InputError("the positions have times but the photos have none: give image times", track.log.path)
-    positions = TimedPositions(track.log.timestamp_s, track.log.position_m)
+    positions = TimedPositions(moments.timestamp_s, track.log.position_m)
     try:
         require_enough(path, len(track.log), TimedPositions)
         samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)

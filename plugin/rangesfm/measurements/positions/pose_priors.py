@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.util.geometry.moments import ByPhoto
 
 _MARK = "SQLite format 3"
 
@@ -50,8 +51,8 @@ def read_pose_priors(path: Path) -> PositionLog:
         path,
         "pose priors",
         at[:, [1, 0, 2]] if is_geographic else at,
+        ByPhoto(tuple(names.get(prior.corr_data_id.id, "") for prior in priors)),
         np.zeros(len(priors), dtype=np.int64),
-        image_name=[names.get(prior.corr_data_id.id, "") for prior in priors],
         covariance_m2=np.full_like(covariances, np.nan) if is_geographic else covariances,
     )
     return replace(log, crs=GEOGRAPHIC if is_geographic else "")

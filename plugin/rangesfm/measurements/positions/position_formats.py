@@ -50,6 +50,7 @@ from rangesfm.util.files.text_tables import (
     read_table,
     read_text,
 )
+from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
 
 _CANONICAL = {
@@ -113,8 +114,9 @@ def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
     optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
     table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, separator=FOUND)
     names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
-    times = table.numbers(names["timestamp"], bounds=TIME_S) if key == "timestamp" else None
-    return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), times, path, [], options)
+    is_timed = key == "timestamp"
+    moments = ByTime(table.numbers(names[key], bounds=TIME_S)) if is_timed else ByPhoto(tuple(table.text(names[key])))
+    return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), moments, path, [], options)
 
 
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
@@ -126,7 +128,6 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
     )
     table, more = layout.read()
     notes += more
-    times = None
     if "timestamp" in columns:
 
         def ask(units: Sequence[str], why: str) -> InputError:
@@ -134,16 +135,19 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
             return UnclearListError("positions", path, layout, [f"the times have {why}"], choices)
 
         said = options.timestamp_unit
-        times, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
+        times_s, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
+        moments: Moments = ByTime(times_s)
+    else:
+        moments = ByPhoto(tuple(table.text(columns["image_name"])))
     units, more = length_units(layout, columns, options.unit)
-    return _log_of_table(table, columns, units, times, path, [*notes, *more], options)
+    return _log_of_table(table, columns, units, moments, path, [*notes, *more], options)
 
 
 def _log_of_table(
     table: TextTable,
     names: Mapping[str, str],
     units: Mapping[str, str],
-    times: Array | None,
+    moments: Moments,
     path: Path,
     notes: list[str],
     options: PositionOptions,
@@ -164,14 +168,12 @@ def _log_of_table(
     if "quality" in names:
         is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
     position[is_lost] = np.nan
-    image_name = [] if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
     log = PositionLog.in_time_order(
         path,
         "table",
         position[kept],
+        moments.subset(np.flatnonzero(kept)),
         table.line[kept],
-        times_s=None if times is None else times[kept],
-        image_name=image_name,
         covariance_m2=_covariances(table, names, units)[kept],
         notes=notes,
     )
@@ -234,7 +236,7 @@ def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
     table = tum_table(path)
     times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
     at_m, unknown_m2 = np.column_stack(places), np.full((len(table), 3, 3), np.nan)
-    return PositionLog.in_time_order(path, "tum", at_m, table.line, times_s=times_s, covariance_m2=unknown_m2)
+    return PositionLog.in_time_order(path, "tum", at_m, ByTime(times_s), table.line, covariance_m2=unknown_m2)
 
 
 def _is_odm(head: str) -> bool:
@@ -272,7 +274,8 @@ def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
     for axis, column in enumerate((6, 6, 7)):
         covariances[:, axis, axis] = np.where(rows[:, column] > 0, rows[:, column], np.nan) ** 2
     covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
-    log = PositionLog.in_time_order(path, "odm", rows[:, :3], lines, image_name=names, covariance_m2=covariances)
+    moments = ByPhoto(tuple(names))
+    log = PositionLog.in_time_order(path, "odm", rows[:, :3], moments, lines, covariance_m2=covariances)
     return replace(log, crs=crs)
 
 
@@ -311,7 +314,7 @@ def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
     values, of_rows = np.array(rows)[kept], np.array(lines)[kept]
     times_s, unknown_m2 = values[:, 0] / 1e3, np.full((len(values), 3, 3), np.nan)
     return PositionLog.in_time_order(
-        path, "marvelmind", values[:, 1:], of_rows, times_s=times_s, covariance_m2=unknown_m2
+        path, "marvelmind", values[:, 1:], ByTime(times_s), of_rows, covariance_m2=unknown_m2
     )
 
 
@@ -354,7 +357,7 @@ def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
     values = np.array(rows).reshape(-1, 4)
     covariances = np.array([np.diag(stddev**2) for stddev in stddevs]).reshape(-1, 3, 3)
     log = PositionLog.in_time_order(
-        path, "nmea", values[:, 1:], lines, times_s=values[:, 0], covariance_m2=covariances, notes=notes
+        path, "nmea", values[:, 1:], ByTime(values[:, 0]), lines, covariance_m2=covariances, notes=notes
     )
     return replace(log, crs=GEOGRAPHIC)
 
@@ -434,8 +437,8 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
         path,
         "rtklib",
         north_first,
+        ByTime(values[:, 0]),
         at_lines,
-        times_s=values[:, 0],
         covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
         notes=notes,
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
+from rangesfm.util.geometry.moments import ByTime, Moments
 
 # The coordinate system in a file's first line, as in ODM's files: by number, by PROJ's parameters, or as a zone of UTM.
 _CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
@@ -46,13 +47,12 @@ def crs_in_text(text: str) -> str:
 
 @dataclass(frozen=True)
 class PositionLog:
-    """n positions of an antenna; exactly one of times and names of photos is given.
+    """n positions of an antenna.
 
     Attributes:
         position_m: (n, 3) in the site's frame, or in ``crs`` as they were read.
         covariance_m2: (n, 3, 3) in the axes east, north, up or x, y, z; NaN where the file does not give it.
-        timestamp_s: (n,) on the system's clock, rising; or None.
-        image_name: names of the n photos; empty for positions by time.
+        moments: when the positions were taken: by time on the system's clock, rising, or by photo.
         line: (n,) lines in the file.
         path: the file, for messages. format: name of its format.
         crs: coordinate system of the positions as they were read; empty if neither their format nor the user says it.
@@ -61,8 +61,7 @@ class PositionLog:
 
     position_m: Array
     covariance_m2: Array
-    timestamp_s: Array | None
-    image_name: tuple[str, ...]
+    moments: Moments
     line: Indices
     path: Path | None = None
     format: str = "table"
@@ -81,11 +80,10 @@ class PositionLog:
         path: Path,
         format: str,
         position_m: Array,
+        moments: Moments,
         line: Sequence[int] | Indices,
         *,
         covariance_m2: Array,
-        times_s: Array | None = None,
-        image_name: Sequence[str] = (),
         notes: Sequence[str] = (),
     ) -> PositionLog:
         """Make a log in the order of time, without rows that have no position or the time of an earlier one.
@@ -103,16 +101,15 @@ class PositionLog:
             raise InputError(f"{lost} (read as {format})", path)
         if num < total:
             told.append(f"{total - num} of {total} rows have no position (no fix) and are left out")
-        if times_s is not None:
-            order = rows[np.argsort(times_s[rows], kind="stable")]
-            rows = order[np.append(True, np.diff(times_s[order]) > 0)]
+        if isinstance(moments, ByTime):
+            order = rows[np.argsort(moments.timestamp_s[rows], kind="stable")]
+            rows = order[np.append(True, np.diff(moments.timestamp_s[order]) > 0)]
             if len(rows) < num:
                 told.append(f"{num - len(rows)} of {num} positions have the time of an earlier one and are left out")
         return PositionLog(
             position_m[rows],
             covariance_m2[rows],
-            None if times_s is None else times_s[rows],
-            tuple(image_name[row] for row in rows.tolist()) if image_name else (),
+            moments.subset(rows),
             np.asarray(line, dtype=np.int64)[rows],
             path,
             format,

@@ -40,6 +40,7 @@ from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
@@ -219,7 +220,7 @@ class PositionScale(KindOnMap):
         if track is None:
             return {}
         mine, used = ~self.known.is_mark, ~self.known.is_mark & self.used
-        off_m, is_timed = self.known.misclosures_m(on_map.estimate)[used], track.log.timestamp_s is not None
+        off_m, is_timed = self.known.misclosures_m(on_map.estimate)[used], isinstance(track.log.moments, ByTime)
         return {
             "num": len(track.log),
             "num_used": int(used.sum()),

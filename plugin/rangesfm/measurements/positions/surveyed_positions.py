@@ -16,6 +16,7 @@ from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_a
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.control_points import ControlPoints, locate_points
 from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
 _OR_DRIFT = ", or these do not meet (by drift of the poses, or as they are of several points)"
@@ -60,7 +61,7 @@ class SurveyedPositions:
     @property
     def needs_times(self) -> bool:
         """True if the photos' times are needed."""
-        return self.antenna is not None and self.antenna.log.timestamp_s is not None
+        return self.antenna is not None and isinstance(self.antenna.log.moments, ByTime)
 
     def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
         """Find the positions that are in a model. Those by a wrong clock are left out.

@@ -31,4 +31,4 @@ def read_true_positions(path: AnyPath) -> Reference:
     assert log is not None
     if log.crs:
         raise InputError(f"the positions are in {log.crs}, expected metres in the frame of the map", path)
-    return Reference(log.position_m, image_names=log.image_name or None, timestamps_s=log.timestamp_s, notes=log.notes)
+    return Reference(log.position_m, log.moments, notes=log.notes)

@@ -15,6 +15,7 @@ from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.photo_names import rows_of_photos
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.motion_prior import learn_motion
 from rangesfm.util.geometry.robust_statistics import robust_stddev
 from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
@@ -61,12 +62,12 @@ def associate(
         InputError: the log needs image times and there are none, or the log has more tags than lever arms.
     """
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
-    if log.image_name is not None:
-        before = after = rows_of_photos(log.image_name, trajectory.image_names)
+    if isinstance(log.moments, ByPhoto):
+        before = after = rows_of_photos(log.moments.image_name, trajectory.image_names)
         fraction = np.zeros(len(log))
         status[before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:
-        times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
+        times = log.moments.later(time_offset_s).timestamp_s
         before, after, fraction = _places_by_time(log, times, trajectory.timestamps_s, options, status)
     else:
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)

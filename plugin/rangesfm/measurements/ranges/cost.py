@@ -21,6 +21,7 @@ from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.robust_statistics import RobustLoss
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -202,7 +203,7 @@ class Ranges(Measurements):
         if not self.takes_part:
             return ()
         rows, log, seen = self.rows, self.observations.log, self.observations
-        times = seen.before + seen.fraction if log.timestamp_s is None else log.timestamp_s
+        times = seen.before + seen.fraction if isinstance(log.moments, ByPhoto) else log.timestamp_s
         return misfits(self.errors, (self.predicted_m(state) - log.range_m)[rows], times[rows])
 
     def antennas_m(self, state: MapState) -> tuple[Array, Array]:

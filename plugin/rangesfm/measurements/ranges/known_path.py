@@ -8,6 +8,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference
 
 
@@ -35,16 +36,16 @@ def tag_positions(
         InputError: the log is by time and the path by name or the reverse, there is a lever arm but no rotations, or no
             range is at a known position.
     """
-    if (log.image_name is None) != (path.image_names is None):
-        ours, theirs = ("name", "time") if path.image_names is None else ("time", "name")
+    if type(log.moments) is not type(path.moments):
+        ours, theirs = ("name", "time") if isinstance(log.moments, ByPhoto) else ("time", "name")
         raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected the same", log.source)
-    keys = log.image_name or () if log.timestamp_s is None else log.timestamp_s + time_offset_s
-    positions, rotations = path.poses(keys, max_gap_s)
+    moments = log.moments.later(time_offset_s)
+    positions, rotations = path.poses(moments, max_gap_s)
     lever = np.asarray(tag_in_cam_m, dtype=np.float64)
     if np.any(lever != 0):
         if rotations is None:
             raise InputError("a lever arm needs the rotations qx,qy,qz,qw besides the positions")
         positions = positions + rotations @ lever
     if len(log) and not np.isfinite(positions).any():
-        raise InputError(path.why_nothing_is_known("ranges", keys, max_gap_s), log.source)
+        raise InputError(path.why_nothing_is_known("ranges", moments, max_gap_s), log.source)
     return positions

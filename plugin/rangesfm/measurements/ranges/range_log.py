@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Categories, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 
 DEFAULT_TAG_ID = "tag"
 # Two ranges between the same nodes cannot have the same time. If at least this share of successive ranges has, the
@@ -36,14 +37,11 @@ class RangeKind(IntEnum):
 class RangeLog:
     """n ranges in the order of the log, between moving tags and static anchors; some may be between two of a kind.
 
-    The time of a range is given by either ``timestamp_s`` or ``image_name``; the other is None.
-
     Attributes:
         anchor_ids: the distinct anchors in natural order (A2 before A10), which does not depend on the log's order.
         anchor_index: (n,) int, index in ``anchor_ids``; -1 for a range between two tags.
         range_m: (n,) ranges in metres, finite and positive.
-        timestamp_s: (n,) seconds on the radio's clock, in any order; or None.
-        image_name: names of the n photos at which the ranges were taken; or None.
+        moments: when the n ranges were taken: by time on the radio's clock, in any order, or by photo.
         range_stddev_m: (n,) standard deviation in metres, NaN where the log does not give it.
         tag_ids: the distinct tags in natural order.
         tag_index: (n,) int, index in ``tag_ids``; -1 for a range between two anchors.
@@ -62,8 +60,7 @@ class RangeLog:
     anchor_ids: tuple[str, ...]
     anchor_index: Indices
     range_m: Array
-    timestamp_s: Array | None
-    image_name: tuple[str, ...] | None
+    moments: Moments
     range_stddev_m: Array
     tag_ids: tuple[str, ...]
     tag_index: Indices
@@ -78,14 +75,12 @@ class RangeLog:
 
     def __post_init__(self) -> None:
         n = len(self.range_m)
-        if (self.timestamp_s is None) == (self.image_name is None):
-            raise ValueError("a range log has either timestamps or image names")
-        for name in ("anchor_index", "range_stddev_m", "tag_index", "peer_index", "los", "line"):
+        for name in ("moments", "anchor_index", "range_stddev_m", "tag_index", "peer_index", "los", "line"):
             if len(getattr(self, name)) != n:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, range_m has {n}")
         if not (np.all(np.isfinite(self.range_m)) and np.all(self.range_m > 0)):
             raise ValueError("ranges are finite and positive")
-        if self.timestamp_s is not None and not np.all(np.isfinite(self.timestamp_s)):
+        if isinstance(self.moments, ByTime) and not np.all(np.isfinite(self.timestamp_s)):
             raise ValueError("timestamps are finite")
         num_ends = np.sum([self.anchor_index >= 0, self.tag_index >= 0, self.peer_index >= 0], axis=0)
         if np.any(num_ends != 2):
@@ -93,6 +88,16 @@ class RangeLog:
 
     def __len__(self) -> int:
         return len(self.range_m)
+
+    @property
+    def timestamp_s(self) -> Array:
+        """(n,) seconds on the radio's clock; NaN where the ranges are by photo."""
+        return self.moments.timestamp_s
+
+    @property
+    def image_name(self) -> tuple[str, ...]:
+        """Names of the n photos at which the ranges were taken; empty texts where the ranges are by time."""
+        return self.moments.image_name
 
     @property
     def kind(self) -> npt.NDArray[np.int8]:
@@ -108,19 +113,12 @@ class RangeLog:
 
         Results computed in this order do not depend on the order of the log, neither by random draws nor by rounding.
         """
-        return np.lexsort((self.range_m, self.peer_index, self.tag_index, self._when, self.anchor_index))
+        return np.lexsort((self.range_m, self.peer_index, self.tag_index, self.moments.sort_keys, self.anchor_index))
 
     def in_time_order(self) -> RangeLog:
         """Return the same ranges sorted by time or photo, anchor and tag; the order of the log makes no difference."""
         of_twins = self.los, np.nan_to_num(self.range_stddev_m), self.range_m, self.peer_index
-        return self.subset(np.lexsort((*of_twins, self.tag_index, self.anchor_index, self._when)))
-
-    @property
-    def _when(self) -> Array | Indices:
-        """Numbers (n,) that sort the ranges by their times, or by the names of their photos."""
-        if self.timestamp_s is not None:
-            return self.timestamp_s
-        return np.unique(np.array(self.image_name or (), dtype=str), return_inverse=True)[1]
+        return self.subset(np.lexsort((*of_twins, self.tag_index, self.anchor_index, self.moments.sort_keys)))
 
     @property
     def time_resolution_s(self) -> float:
@@ -128,9 +126,9 @@ class RangeLog:
 
         A step is found if it is longer than the time between two ranges of one tag and one anchor.
         """
-        times = self.timestamp_s
-        if times is None or len(self) < 2:
+        if not isinstance(self.moments, ByTime) or len(self) < 2:
             return 0.0
+        times = self.timestamp_s
         steps, _ = self._steps_of_links(times, np.argsort(times, kind="stable"))
         if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
             return 0.0
@@ -140,7 +138,7 @@ class RangeLog:
     @property
     def num_restarts(self) -> int:
         """Number of times that the clock jumps back by a quarter of the log or more; 0 if the log is unordered."""
-        if self.timestamp_s is None or len(self) < 2:
+        if not isinstance(self.moments, ByTime) or len(self) < 2:
             return 0
         steps, link = self._steps_of_links(self.timestamp_s, np.arange(len(self)))
         if np.count_nonzero(steps < 0) > _MOST_GOING_BACK * len(steps):
@@ -208,15 +206,13 @@ class RangeLog:
 
     def subset(self, rows: Indices | Mask) -> RangeLog:
         """Return the log with some of its ranges; anchors and tags without ranges are dropped."""
-        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        index = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows.astype(np.int64)
         columns: dict[str, Any] = {
-            name: values[rows]
+            name: values[index]
             for name in (each.name for each in fields(self))
             if isinstance(values := getattr(self, name), np.ndarray)
         }
-        if self.image_name is not None:
-            columns["image_name"] = tuple(self.image_name[row] for row in rows)
-        chosen = replace(self, **columns)
+        chosen = replace(self, moments=self.moments.subset(index), **columns)
         ids, first, second = chosen._ends()
         return chosen._between(ids, np.arange(len(ids)) < len(self.anchor_ids), first, second)
 
@@ -243,15 +239,15 @@ class RangeLog:
         anchor_id: Sequence[str] | npt.NDArray[np.str_] | Categories,
         range_m: npt.ArrayLike,
         *,
-        timestamp_s: npt.ArrayLike | None = None,
-        image_name: list[str] | None = None,
+        timestamp_s: npt.ArrayLike = (),
+        image_name: Sequence[str] = (),
         range_stddev_m: npt.ArrayLike | None = None,
         tag_id: Sequence[str] | Categories | None = None,
         los: npt.ArrayLike | None = None,
         line: npt.ArrayLike | None = None,
         **of_log: Any,
     ) -> RangeLog:
-        """Build a log from one value (or one string) per range; optional columns may be left out.
+        """Build a log from one value (or one string) per range, by time or by photo; other columns may be left out.
 
         Each range is between the tag and the anchor of its row. ``with_anchors`` afterwards finds the ranges between
         two anchors or two tags.
@@ -260,14 +256,16 @@ class RangeLog:
             of_log: ``source``, ``format``, ``num_no_measurement`` and ``notes``.
         """
         n = np.size(range_m)
+        times_s, photos = np.asarray(timestamp_s, np.float64), tuple(image_name)
+        if len(times_s) and photos:
+            raise ValueError("a range log has either timestamps or image names")
         anchor = _categories(anchor_id)
         tag = _categories([DEFAULT_TAG_ID] * n if tag_id is None else tag_id)
         return RangeLog(
             anchor_ids=anchor.names,
             anchor_index=anchor.index,
             range_m=np.asarray(range_m, np.float64),
-            timestamp_s=None if timestamp_s is None else np.asarray(timestamp_s, np.float64),
-            image_name=None if image_name is None else tuple(image_name),
+            moments=ByTime(times_s) if len(times_s) else ByPhoto(photos),
             range_stddev_m=np.full(n, np.nan) if range_stddev_m is None else np.asarray(range_stddev_m, np.float64),
             tag_ids=tag.names,
             tag_index=tag.index,

@@ -14,6 +14,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.similarity import Similarity
 
 
@@ -148,7 +149,7 @@ def hold_out(observations: RangeObservations, checks: RangesOptions, seed: int) 
 
 
 def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> Mask:
-    if log.timestamp_s is None:
+    if isinstance(log.moments, ByPhoto):
         raise InputError("check_times_s needs a log with times, this one names photos", log.source)
     first, last = times_s
     inside: Mask = (log.timestamp_s >= first) & (log.timestamp_s <= last)

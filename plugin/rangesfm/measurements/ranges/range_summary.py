@@ -11,6 +11,7 @@ import numpy as np
 from rangesfm.arrays import Array, Mask
 from rangesfm.measurements.ranges.errors.noise import estimate_noise_m, find_quantization_m, quantization_stddev_m
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class RangeSummary:
 def summarize_ranges(log: RangeLog) -> RangeSummary:
     """Compute the summary of a log."""
     start = end = rate = math.nan
-    if log.timestamp_s is not None and len(log):
+    if isinstance(log.moments, ByTime) and len(log):
         start, end = float(log.timestamp_s.min()), float(log.timestamp_s.max())
         rate = (len(log) - 1) / (end - start) if end > start else math.nan
     quantization = find_quantization_m(log.range_m) or 0.0
@@ -83,13 +84,13 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
         num=len(log),
         num_no_measurement=log.num_no_measurement,
         num_duplicates=_num_duplicates(log),
-        num_out_of_order=0 if log.timestamp_s is None else int(np.count_nonzero(np.diff(log.timestamp_s) < 0)),
+        num_out_of_order=int(np.count_nonzero(np.diff(log.timestamp_s) < 0)),
         quantization_m=quantization,
         tag_ids=log.tag_ids,
         start_s=start,
         end_s=end,
         rate_hz=rate,
-        largest_gap_s=_largest_gap(np.zeros(0) if log.timestamp_s is None else log.timestamp_s),
+        largest_gap_s=_largest_gap(log.timestamp_s),
         anchors=tuple(
             _summarize_anchor(log, index, quantization)
             for index in np.unique(log.anchor_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
@@ -112,7 +113,7 @@ def _summarize_pairs(log: RangeLog, name: str, kind: RangeKind) -> Iterator[Link
 
 def _summarize_anchor(log: RangeLog, index: int, quantization_m: float) -> LinkSummary:
     mine = (log.anchor_index == index) & (log.kind == RangeKind.TAG_ANCHOR)
-    gap_s = _largest_gap(np.zeros(0) if log.timestamp_s is None else log.timestamp_s[mine])
+    gap_s = _largest_gap(log.timestamp_s[mine])
     noise_m = _noise(log, mine, quantization_m)
     return LinkSummary("tag-anchor", (log.anchor_ids[index],), *_lengths(log.range_m[mine]), gap_s, noise_m)
 
@@ -126,7 +127,7 @@ def _noise(log: RangeLog, mine: Mask, quantization_m: float) -> float:
 
     Only one tag is used, because each tag has a path of its own.
     """
-    if log.timestamp_s is None:
+    if isinstance(log.moments, ByPhoto):
         return math.nan
     mine = mine & (log.tag_index == np.argmax(np.bincount(log.tag_index[mine])))
     noise = estimate_noise_m(log.timestamp_s[mine], log.range_m[mine])
@@ -134,8 +135,6 @@ def _noise(log: RangeLog, mine: Mask, quantization_m: float) -> float:
 
 
 def _num_duplicates(log: RangeLog) -> int:
-    if log.timestamp_s is None:
-        return 0
     columns = (log.timestamp_s, log.anchor_index, log.tag_index, log.peer_index, log.range_m)
     order = np.lexsort(columns)
     same = np.logical_and.reduce([np.diff(column[order]) == 0 for column in columns])

@@ -30,6 +30,7 @@ from rangesfm.util.files.text_tables import (
     repeated,
     write_table,
 )
+from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -42,26 +43,24 @@ MAX_TIME_DIFFERENCE_S = 0.01
 
 @dataclass(frozen=True)
 class Reference:
-    """n known camera poses, by photo or by time; exactly one of names and times is given.
+    """n known camera poses.
 
     Attributes:
         positions_m: (n, 3) projection centres in the reference's frame, metres.
-        image_names: names of the n photos, or None.
-        timestamps_s: (n,) times on the camera's clock, strictly increasing, or None.
+        moments: when the poses are known: by photo, or by time on the camera's clock, strictly increasing.
         world_from_cam: (n, 3, 3) rotations of COLMAP's camera frame (x right, y down, z forward), or None.
         notes: lines for the user about how the file was read.
     """
 
     positions_m: Array
-    image_names: tuple[str, ...] | None = None
-    timestamps_s: Array | None = None
+    moments: Moments
     world_from_cam: Array | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if (self.image_names is None) == (self.timestamps_s is None):
-            raise ValueError("a reference has either image names or timestamps")
-        if self.timestamps_s is not None and not np.all(np.diff(self.timestamps_s) > 0):
+        if len(self.moments) != len(self):
+            raise ValueError(f"a reference of {len(self)} poses at {len(self.moments)} moments")
+        if isinstance(self.moments, ByTime) and not np.all(np.diff(self.moments.timestamp_s) > 0):
             raise ValueError("timestamps increase strictly")
 
     def __len__(self) -> int:
@@ -73,34 +72,33 @@ class Reference:
         Raises:
             InputError: the reference is by time and the trajectory has no times.
         """
-        return self.poses(self.keys_of(trajectory), max_gap_s)
+        return self.poses(self.moments_of(trajectory), max_gap_s)
 
-    def keys_of(self, trajectory: Trajectory) -> Sequence[str] | Array:
-        """Return the names or times of a trajectory's keyframes, whichever the reference is by; errors as above."""
-        if self.image_names is not None:
-            return trajectory.image_names
+    def moments_of(self, trajectory: Trajectory) -> Moments:
+        """Return the photos or times of a trajectory's keyframes, whichever the reference is by; errors as above."""
+        if isinstance(self.moments, ByPhoto):
+            return ByPhoto(trajectory.image_names)
         if trajectory.timestamps_s is None:
             raise InputError("the reference is by time, but the photos have no times (images.csv)")
-        return trajectory.timestamps_s
+        return ByTime(trajectory.timestamps_s)
 
-    def poses(self, keys: Sequence[str] | Array, max_gap_s: float) -> tuple[Array, Array | None]:
-        """Return the reference poses of n photos, or at n times.
+    def poses(self, moments: Moments, max_gap_s: float) -> tuple[Array, Array | None]:
+        """Return the reference poses at n moments.
 
         Poses by photo are found by name. Poses by time are interpolated linearly (rotations on the shortest arc)
         between two samples at most ``max_gap_s`` apart. In longer gaps and at the ends, the nearest sample is taken if
         it is within MAX_TIME_DIFFERENCE_S.
 
         Args:
-            keys: names of n photos if the reference is by photo, else (n,) times on the camera's clock.
+            moments: by photo or by time on the camera's clock, as those of the reference.
 
         Returns:
             (n, 3) positions in metres and (n, 3, 3) rotations, NaN where unknown; rotations are None if the reference
             has none.
         """
-        if not isinstance(keys, np.ndarray):
-            return self._at_index(rows_of_photos(keys, self.image_names or ()))
-        assert self.timestamps_s is not None
-        times_s, known = keys, self.timestamps_s
+        if isinstance(moments, ByPhoto):
+            return self._at_index(rows_of_photos(moments.image_name, self.moments.image_name))
+        times_s, known = moments.timestamp_s, self.moments.timestamp_s
         before, after, fraction, nearest = keyframes_around(times_s, known)
         nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
         positions, rotations = self._at_index(nearest)
@@ -117,24 +115,24 @@ class Reference:
             rotations[between] = turned.as_matrix()
         return positions, rotations
 
-    def why_nothing_is_known(self, of: str, keys: Sequence[str] | Array, max_gap_s: float = 0.05) -> str:
+    def why_nothing_is_known(self, of: str, moments: Moments, max_gap_s: float = 0.05) -> str:
         """Return a one-line message that explains why no keyframe or range is at a known position.
 
         Args:
-            of: "keyframes" or "ranges", with their ``keys`` as for ``poses``.
+            of: "keyframes" or "ranges", with their ``moments`` as for ``poses``.
         """
         why = f"none of the {of} is at a known position: "
-        if len(self) == 0 or len(keys) == 0:
+        if len(self) == 0 or len(moments) == 0:
             return f"{why}there are {len(self)} known positions, or no {of}"
-        if not isinstance(keys, np.ndarray):
-            known, first = printable((self.image_names or ("",))[0]), printable(keys[0])
+        if isinstance(moments, ByPhoto):
+            known, first = printable(self.moments.image_name[0]), printable(moments.image_name[0])
             return f"{why}the first known position is of photo '{known}', the first of the {of} of photo '{first}'"
-        assert self.timestamps_s is not None
-        spacing = np.diff(self.timestamps_s)
+        known_s, times_s = self.moments.timestamp_s, moments.timestamp_s
+        spacing = np.diff(known_s)
         return (
-            f"{why}positions are known from {span_text(self.timestamps_s[0], self.timestamps_s[-1])}"
+            f"{why}positions are known from {span_text(known_s[0], known_s[-1])}"
             + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
-            + f", the {of} are from {span_text(keys.min(), keys.max())}; positions are interpolated between "
+            + f", the {of} are from {span_text(times_s.min(), times_s.max())}; positions are interpolated between "
             f"known times at most {max_gap_s:g} s apart"
         )
 
@@ -143,7 +141,7 @@ class Reference:
         return _rows(self.positions_m, index), rotations
 
 
-NO_REFERENCE = Reference(np.zeros((0, 3)), image_names=())
+NO_REFERENCE = Reference(np.zeros((0, 3)), ByPhoto(()))
 
 
 def is_reference_file(head: str) -> bool:
@@ -182,8 +180,8 @@ def write_reference(reference: Reference, path: Path) -> Path:
     if reference.world_from_cam is not None:
         columns.append(Rotation.from_matrix(reference.world_from_cam).as_quat())
         names += QUATERNION_COLUMNS
-    is_by_image = reference.image_names is not None
-    keys = reference.image_names or [f"{time:.9f}" for time in np.asarray(reference.timestamps_s)]
+    moments, is_by_image = reference.moments, isinstance(reference.moments, ByPhoto)
+    keys = moments.image_name if is_by_image else [f"{time:.9f}" for time in moments.timestamp_s]
     rows = ([key, *(f"{value:.9f}" for value in row)] for key, row in zip(keys, np.hstack(columns)))
     write_table(path, ["image_name" if is_by_image else "timestamp_s", *names], rows)
     return path
@@ -235,14 +233,14 @@ def _from_table(table: TextTable, key: str) -> Reference:
     if key == "image_name":
         if again := repeated(table.text(key)):
             raise table.error(again[0], key, "each one once")
-        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations, notes=notes)
+        return Reference(positions, ByPhoto(tuple(table.text(key))), rotations, notes)
     times = table.numbers(key, bounds=TIME_S)
     _, order = np.unique(times, return_index=True)  # motion capture may write two poses with one rounded time
     if num_again := len(times) - len(order):
         told = f"{num_again} of {len(times)} poses have the time of an earlier one and are left out"
         notes = (*notes, f"{table.path.name}: {told}")
     turns = None if rotations is None else rotations[order]
-    return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns, notes=notes)
+    return Reference(positions[order], ByTime(times[order]), turns, notes)
 
 
 def _with_positions(table: TextTable) -> tuple[TextTable, tuple[str, ...]]:

@@ -16,6 +16,7 @@ from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.progress import Progress
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -89,11 +90,6 @@ def range_times(start_s: float, end_s: float, rate_hz: float = 10, seed: int = 0
     return np.sort(np.random.default_rng([seed, 3]).uniform(start_s, end_s, int((end_s - start_s) * rate_hz)))
 
 
-def times_of(log: RangeLog) -> Array:
-    assert log.timestamp_s is not None
-    return log.timestamp_s
-
-
 def estimate(log: RangeLog, photos: Trajectory, tag_in_cam_m: tuple[float, float, float] = TAG_IN_CAM_M) -> TimeOffset:
     return estimate_time_offset(log, photos, tag_in_cam_m)
 
@@ -111,7 +107,7 @@ def test_offset_is_found_through_outliers_whatever_the_epochs(num_anchors: int, 
 def test_estimate_follows_a_shift_of_the_log() -> None:
     walk = handheld(40)
     log, photos = walk.log(range_times(0, 40), 0.0), walk.photos(photo_times(40))
-    shifted = replace(log, timestamp_s=times_of(log) - 3600.37)
+    shifted = replace(log, moments=ByTime(log.timestamp_s - 3600.37))
     assert estimate(shifted, photos).value_s - estimate(log, photos).value_s == pytest.approx(3600.37, abs=1e-3)
 
 
@@ -141,7 +137,7 @@ def both_tags(first: RangeLog, second: RangeLog) -> RangeLog:
     return RangeLog.from_arrays(
         ids,
         np.concatenate([first.range_m, second.range_m]),
-        timestamp_s=np.concatenate([times_of(first), times_of(second)]),
+        timestamp_s=np.concatenate([first.timestamp_s, second.timestamp_s]),
         tag_id=["left"] * len(first) + ["right"] * len(second),
     )
 
@@ -167,8 +163,8 @@ def test_radio_that_runs_for_an_hour_around_a_short_walk_is_placed() -> None:
 def test_radio_clock_that_is_set_during_the_log_is_followed_after_that() -> None:
     walk = handheld(60)
     log = walk.log(range_times(-10, 60), 100.0)
-    was_set = times_of(log) - np.where(np.arange(len(log)) < 150, 1.6e9, 0.0)
-    found = estimate(replace(log, timestamp_s=was_set), walk.photos(photo_times(60)))
+    was_set = log.timestamp_s - np.where(np.arange(len(log)) < 150, 1.6e9, 0.0)
+    found = estimate(replace(log, moments=ByTime(was_set)), walk.photos(photo_times(60)))
     assert found.value_s == pytest.approx(100.0, abs=0.03)
 
 
@@ -183,7 +179,7 @@ def test_drift_of_200_ppm_is_noticed_and_named_and_followed() -> None:
     assert "the clocks drift: the camera's gains +" in found.note
     assert "ppm on the radio's" in found.note
     # The offset changes by 0.12 s over the log, and is known to a few milliseconds everywhere.
-    np.testing.assert_allclose(found.at(times_of(log)), times - times_of(log), atol=0.015)
+    np.testing.assert_allclose(found.at(log.timestamp_s), times - log.timestamp_s, atol=0.015)
 
 
 def test_clocks_that_run_alike_are_not_said_to_drift() -> None:
@@ -214,7 +210,7 @@ def test_stddev_covers_what_whole_seconds_do_to_the_offset(photos_are_rounded: b
         if photos_are_rounded:
             photos = replace(photos, timestamps_s=np.rint(times), time_resolution_s=1.0)
         if log_is_rounded:
-            log = replace(log, timestamp_s=np.rint(times_of(log)))
+            log = replace(log, moments=ByTime(np.rint(log.timestamp_s)))
         found = estimate(log, photos)
         errors_in_stddevs.append((found.value_s - 3.0) / found.stddev_s)
         stddevs.append(found.stddev_s)
@@ -384,9 +380,10 @@ def test_log_of_another_walk_is_refused(num_anchors: int) -> None:
 
 
 def test_empty_log_is_refused() -> None:
+    empty = RangeLog.from_arrays(["A"], [1.0], timestamp_s=[0.0]).subset(np.zeros(1, dtype=bool))
     for times in (photo_times(20), 4 * photo_times(5)):
         with pytest.raises(GeometryError, match="--ranges_time_offset"):
-            estimate(RangeLog.from_arrays([], [], timestamp_s=[]), handheld(20).photos(times))
+            estimate(empty, handheld(20).photos(times))
 
 
 @pytest.mark.parametrize("num_ranges", [1, 7, 30])

@@ -14,6 +14,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import read_ranges, reader_names, write_ranges_csv
 from rangesfm.measurements.ranges.readers.measured import REACH_M
+from rangesfm.util.geometry.moments import ByPhoto
 
 any_bytes_in_one_folder = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -62,8 +63,7 @@ def test_optional_columns_are_read(tmp_path: Path) -> None:
 
 def test_image_names_may_take_the_place_of_times(tmp_path: Path) -> None:
     log = read_ranges(write(tmp_path, "image_name,anchor_id,range_m\nx/1.jpg,a,1\nx/2.jpg,a,0\nx/3.jpg,a,2\n"))
-    assert log.timestamp_s is None
-    assert log.image_name == ("x/1.jpg", "x/3.jpg")
+    assert log.moments == ByPhoto(("x/1.jpg", "x/3.jpg"))
 
 
 def test_range_of_zero_is_counted_as_no_measurement_and_left_out(tmp_path: Path) -> None:
@@ -93,7 +93,6 @@ def test_negative_ranges_are_no_measurement_as_zeros_are(tmp_path: Path) -> None
 @pytest.mark.parametrize(("cell", "unit"), [("1717961938397366000", "ns"), ("1717961938397366", "us")])
 def test_times_that_cannot_be_seconds_are_noticed_under_any_name(tmp_path: Path, cell: str, unit: str) -> None:
     log = read_ranges(write(tmp_path, f"timestamp_s,anchor_id,range_m\n{cell},a,1\n"))
-    assert log.timestamp_s is not None
     np.testing.assert_allclose(log.timestamp_s, [1717961938.397366], atol=1e-6)
     assert log.notes == (f"timestamp_s has as many digits as {unit} since 1970: taken as {unit}",)
 
@@ -184,7 +183,6 @@ MAPPING = {"timestamp": "t", "anchor_id": "node", "range": "d"}
 )
 def test_time_units(tmp_path: Path, unit: str, cell: str, seconds: float) -> None:
     log = read_ranges(write(tmp_path, f"t,node,d\n{cell},7,3\n"), columns=MAPPING, timestamp_unit=unit)
-    assert log.timestamp_s is not None
     np.testing.assert_allclose(log.timestamp_s, [seconds], rtol=1e-12)
     assert log.format == "mapped"
 

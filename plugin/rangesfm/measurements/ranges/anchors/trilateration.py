@@ -26,6 +26,7 @@ from rangesfm.measurements.ranges.anchors.point_fit import (
 )
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, cost_at, solve
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
 from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
@@ -221,8 +222,8 @@ def trilaterate_anchors(
             )
             for k in heard
         ]
-        by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if log.timestamp_s is None else []
-        times_s = np.concatenate(by_walk) if log.timestamp_s is None else log.timestamp_s[rows]
+        by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if isinstance(log.moments, ByPhoto) else []
+        times_s = np.concatenate(by_walk) if by_walk else log.timestamp_s[rows]
         found = dict(zip(heard.tolist(), judged_fits(fits, times_s, log.tag_index[rows], curve_m), strict=True))
     placements = []
     for k, anchor_id in enumerate(log.anchor_ids):

@@ -20,6 +20,7 @@ from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.options import RangesOptions
 from rangesfm.progress import SILENT, Progress
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
@@ -76,7 +77,7 @@ def estimate_time_offset(
         InputError: log or photos have no times, or the log has more tags than lever arms.
         GeometryError: the motion does not determine the offset, not even up to a few alternatives.
     """
-    if log.timestamp_s is None:
+    if isinstance(log.moments, ByPhoto):
         raise InputError("the log has no timestamps, so that no time offset can be found", log.source)
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")

@@ -78,7 +78,6 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
         raise GeometryError(f"{len(used)} ranges of known length, expected {_MIN_RANGES} or more to learn from")
     distance, error, index = distance[used], (log.range_m - distance)[used], log.anchor_index[used]
     knots, num_anchors = _knots(distance), len(log.anchor_ids)
-    times = np.unique(np.array(log.image_name), return_inverse=True)[1] if log.timestamp_s is None else log.timestamp_s
     off, axes = error - np.median(error), np.tile(np.eye(3), (len(used), 1, 1))
     for _ in range(NUM_REWEIGHTINGS):
         noise_m = robust_stddev(off)
@@ -86,7 +85,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
         bins = range_bins(
             index,
             log.tag_index[used],
-            times[used].astype(np.float64),
+            log.moments.sort_keys[used],
             from_anchor_m[used],
             axes,
             weights,

@@ -27,6 +27,7 @@ from rangesfm.measurements.ranges.errors.noise import (
 )
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RangeModelOptions
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, RobustLoss, robust_stddev
 
@@ -98,7 +99,7 @@ class RangeErrors:
         given = log.range_stddev_m[rows]
         if range_model.range_stddev_m is not None:
             given = np.where(np.isfinite(given), given, range_model.range_stddev_m)
-        times = None if log.timestamp_s is None else log.timestamp_s[rows]
+        is_by_photo = isinstance(log.moments, ByPhoto)
         shared, nothing = shared_stddev(log.range_m, log.shared_stddev_m)[rows], np.zeros(len(rows), dtype=np.int64)
         return cls(
             stddev_m=np.hypot(np.where(np.isfinite(given), given, START_STDDEV_M), shared),
@@ -108,7 +109,7 @@ class RangeErrors:
             shared_m=shared,
             placing_m=np.zeros(len(rows)),
             anchor_index=log.anchor_index[rows],
-            block=observations.before[rows] if times is None else stretch_labels(times, STRETCH_S),
+            block=observations.before[rows] if is_by_photo else stretch_labels(log.timestamp_s[rows], STRETCH_S),
             place=nothing,
             loss=GEMAN_MCCLURE,
             common_bias_stddev_m=range_model.common_bias_stddev_m,

@@ -25,6 +25,7 @@ from rangesfm.util.files.bags import is_bag_folder
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.folders import natural_order
 from rangesfm.util.files.text_tables import read_head
+from rangesfm.util.geometry.moments import ByPhoto
 
 __all__ = ["files_of_log", "find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
@@ -106,7 +107,7 @@ def _check_numbers(log: RangeLog) -> None:
     numbers = {
         "range_m": (log.range_m, LENGTH_M),
         "range_stddev_m": (log.range_stddev_m, STDDEV_M),
-        "timestamp_s": (np.zeros(0) if log.timestamp_s is None else log.timestamp_s, TIME_S),
+        "timestamp_s": (log.timestamp_s, TIME_S),
     }
     for name, (values, bounds) in numbers.items():
         wrong = ~bounds.hold(values) & ~np.isnan(values)
@@ -149,18 +150,18 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str) ->
 
 def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
     """Join logs into one, sorted by time if there are times; each range is between the tag and anchor of its record."""
-    if len({log.timestamp_s is None for log in logs}) > 1:
+    if len({type(log.moments) for log in logs}) > 1:
         raise InputError("some of the files have times and others names of photos, expected the same in all", source)
     ends = [log.end_ids() for log in logs]
-    times = [log.timestamp_s for log in logs if log.timestamp_s is not None]
+    is_by_photo = isinstance(logs[0].moments, ByPhoto)
     columns = {
         name: np.concatenate([getattr(log, name) for log in logs])
         for name in ("range_m", "range_stddev_m", "los", "line")
     }
     joined = RangeLog.from_arrays(
         [anchor_id for _, anchor_ids in ends for anchor_id in anchor_ids],
-        timestamp_s=np.concatenate(times) if times else None,
-        image_name=None if times else [name for log in logs for name in log.image_name or ()],
+        timestamp_s=() if is_by_photo else np.concatenate([log.timestamp_s for log in logs]),
+        image_name=[name for log in logs for name in log.image_name] if is_by_photo else (),
         tag_id=[tag_id for tag_ids, _ in ends for tag_id in tag_ids],
         source=source,
         format=logs[0].format,
@@ -168,7 +169,7 @@ def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
         notes=(f"{len(logs)} files as one log", *dict.fromkeys(note for log in logs for note in log.notes)),
         **columns,
     )
-    return joined if joined.timestamp_s is None else joined.subset(np.argsort(joined.timestamp_s, kind="stable"))
+    return joined if is_by_photo else joined.subset(np.argsort(joined.timestamp_s, kind="stable"))
 
 
 def files_of_log(path: Path) -> list[Path]:

@@ -95,7 +95,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     name = {key: column for key, column in named.items() if column in table}
     units = layout.units if layout else {}
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
-    timestamps = None
+    timestamps = np.zeros(0)
     if "timestamp" in name:
         ask = partial(options.which_unit, path, "timestamp")
         # One anchor after the other in a file: the times go back to the log's beginning, whatever the clock is.
@@ -103,7 +103,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
         timestamps, _ = read_timestamps(
             table, name, units, options.timestamp_unit, notes, ask, may_wrap=bool(in_turn or len(anchor.names) < 2)
         )
-    image_name = table.text(name["image_name"]) if timestamps is None else None
+    image_name = [] if "timestamp" in name else table.text(name["image_name"])
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
     ranges = _ranges(table, name, columns, options)
@@ -115,7 +115,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
         column = name.get("range") or next(iter(columns.wide))
         column = f"{column} {units.get(column, '')}".strip()
         ask = partial(options.which_unit, path, "range")
-        times = np.zeros(0) if timestamps is None else timestamps[row[measured]]
+        times = timestamps[row[measured]] if "timestamp" in name else timestamps
         unit = options.range_unit or range_unit(column, ranges[measured], times, link[measured], notes, ask)
         mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
         others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges[measured], unit)]
@@ -130,8 +130,8 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     return RangeLog.from_arrays(
         anchor,
         ranges_m[measured],
-        timestamp_s=None if timestamps is None else timestamps[row],
-        image_name=None if image_name is None else [image_name[k] for k in row.tolist()],
+        timestamp_s=timestamps[row] if "timestamp" in name else timestamps,
+        image_name=[image_name[k] for k in row.tolist()] if image_name else (),
         range_stddev_m=stddevs[row],
         tag_id=tag,
         los=los[row],

@@ -15,6 +15,7 @@ from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.util.files.text_tables import MAX_NUMBER
+from rangesfm.util.geometry.moments import ByPhoto
 
 REACH_M = 2000.0
 """Range that no UWB radio measures; the farthest reach somewhat more than one kilometre."""
@@ -131,7 +132,7 @@ def without_held(log: RangeLog) -> RangeLog:
 
     The first of equal values stays, at the time at which it came.
     """
-    if log.timestamp_s is None:
+    if isinstance(log.moments, ByPhoto):
         return log
     firsts: list[Indices] = []
     lengths, jumps = [np.zeros(0, np.int64)], [np.zeros(0)]

@@ -23,6 +23,7 @@ from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions,
 from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import header_names, read_head, write_user_table
+from rangesfm.util.geometry.moments import ByTime
 
 _BY_TIME = RangeColumns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
@@ -221,10 +222,10 @@ def write_ranges_csv(log: RangeLog, path: AnyPath) -> None:
         InputError: the file cannot be written.
     """
     columns: dict[str, Iterable[str]] = {}
-    if log.timestamp_s is not None:
+    if isinstance(log.moments, ByTime):
         columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
     else:
-        columns["image_name"] = log.image_name or ()
+        columns["image_name"] = log.image_name
     tag_id, columns["anchor_id"] = log.end_ids()
     columns["range_m"] = map(repr, log.range_m.tolist())
     if set(tag_id) != {DEFAULT_TAG_ID}:

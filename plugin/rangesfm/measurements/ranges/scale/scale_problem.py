@@ -23,6 +23,7 @@ from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
 from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory, first_camera_from
 
@@ -125,7 +126,8 @@ class ScaleProblem:
         """
         times = self.trajectory.timestamps_s
         # Two photos at once, or a path that goes back in time, have no velocity.
-        if self.observations.log.timestamp_s is None or times is None or len(times) < 2 or (np.diff(times) <= 0).any():
+        is_by_photo = isinstance(self.observations.log.moments, ByPhoto)
+        if is_by_photo or times is None or len(times) < 2 or (np.diff(times) <= 0).any():
             return None
         velocities = np.gradient(self.trajectory.centers, times, axis=0)[self._nearest]
         return np.asarray(velocities @ self.trajectory.world_from_cam[0])
@@ -142,8 +144,8 @@ class ScaleProblem:
 
     def times_s(self, metres_per_unit: float) -> Array:
         """Return (k,) times of the ranges in seconds; where the log names photos, as of somebody who walks."""
-        if self.observations.log.timestamp_s is not None:
-            return self.observations.log.timestamp_s[self.rows]
+        if isinstance(moments := self.observations.log.moments, ByTime):
+            return moments.timestamp_s[self.rows]
         before = self.observations.before[self.rows]
         _, first, of_range = np.unique(before, return_index=True, return_inverse=True)
         return walking_times_s(metres_per_unit * self.ranges.centers[first])[of_range]
