@@ -1,7 +1,7 @@
 """Measure the stages from photos to a model, beside the same calls of pycolmap with all its threads.
 
 python -m tests.benchmarks.reconstruction PHOTOS[:EVERY_NTH] ... [--num_threads 2] [--num_rounds 3] [--seed 0]
-    [--camera_model OPENCV --camera_params 377,432,...] [--only stages|matching|mapping]
+    [--camera_model OPENCV --camera_params 377,432,...]
 python -m tests.benchmarks.reconstruction SURVEY.toml ... [--base_path DATA_FOLDER] [--num_threads 2] [--num_rounds 3]
 
 PHOTOS are folders, for example ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. The photos
@@ -9,16 +9,6 @@ of a folder are taken in the order of their names and matched sequentially. Each
 are the medians of the wall-clock seconds and of the processor seconds (user and system, child processes included; other
 load on the machine disturbs these less), their ratios within each round (median, smallest and largest), and the
 machine's load. "all" is the whole call, from reading the photos to reading the models.
-
-The second table is about matching alone, on the same features: by one process bound to one core, by one that is not, by
-``--num_threads`` processes and by twice as many. It gives how many cores each keeps busy, and whether the matches are
-the same, row for row. A process matches in one thread and verifies in another, so on two cores it is not much slower
-than two processes. Compare with the process bound to one core to see how matching scales.
-
-The third table is about incremental mapping alone, from the same matches: by rangesfm with ``reproducible`` (in one
-thread), and by rangesfm and pycolmap with ``--num_threads``. "Caller" are the processor seconds of the thread that
-calls the mapper: the wall-clock time on a machine without other load, if the other threads never keep it waiting. The
-last column gives how many different models the rounds have given.
 
 Of a survey, the way to its refined metric map (``rangesfm run``, without the report) is measured beside that of
 pycolmap's calls to an unscaled one, with neighbours matched by COLMAP's own options. ``--base_path`` is as for
@@ -30,22 +20,17 @@ A calibrated camera is held fixed by pycolmap's mapping, too. That is faster tha
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
 import resource
-import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import pycolmap
-from tests.sfm.matches import content_of
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.mapper_options import MapperOptions
@@ -53,19 +38,12 @@ from rangesfm.options import CameraOptions
 from rangesfm.pipeline.map_photos import find_keyframes
 from rangesfm.pipeline.run import run_survey
 from rangesfm.progress import Journal, Progress
-from rangesfm.sfm.database import clear_matches
 from rangesfm.sfm.image_times import list_images
-from rangesfm.sfm.incremental_mapping import incremental_mapping
-from rangesfm.sfm.mapping import pipeline_options
-from rangesfm.sfm.matching import match_features, matching_options
-from rangesfm.sfm.photo_files import usable_photos
 from rangesfm.sfm.reconstruct import reconstruct
-from rangesfm.sfm.steps import Workspace
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
 
 STAGES = ("features", "matching", "mapping")
-WAYS = ("rangesfm, reproducible", "rangesfm", "pycolmap")
 
 
 @dataclass(frozen=True)
@@ -82,10 +60,6 @@ class Effort:
 
     def __sub__(self, other: Effort) -> Effort:
         return Effort(self.clock_s - other.clock_s, self.processor_s - other.processor_s)
-
-    @property
-    def num_busy_cores(self) -> float:
-        return self.processor_s / self.clock_s
 
 
 def effort_of(work: Callable[[], object]) -> Effort:
@@ -175,78 +149,6 @@ def compare_with_metric_map(survey: Survey, num: int, num_rounds: int, seed: int
     print(f"ratio, clock {clock}, processors {processor}", flush=True)
 
 
-def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes: int, seed: int) -> Effort:
-    """Match the photos anew, and return the effort of matching alone."""
-    clear_matches(database)
-    options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
-    usable, space = usable_photos(photos, names), Workspace(database.parent, Progress())
-    with space.logged():
-        return effort_of(lambda: match_features(space, usable, options))
-
-
-@dataclass(frozen=True)
-class Mapped:
-    """One mapping from given matches.
-
-    Attributes:
-        caller_s: processor seconds of the thread that called the mapper.
-        content: hash of all models.
-    """
-
-    effort: Effort
-    caller_s: float
-    content: str
-
-
-def map_anew(photos: Path, database: Path, way: str, num_threads: int, seed: int) -> Mapped:
-    """Map the photos from their matches in one of ``WAYS``, from the same seed."""
-    models: list[pycolmap.Reconstruction] = []
-    mapper = MapperOptions(num_threads=num_threads, reproducible=way == WAYS[0])
-    ours = pipeline_options(CameraOptions(), mapper, seed)
-    assert isinstance(ours, pycolmap.IncrementalPipelineOptions)
-    theirs = pycolmap.IncrementalPipelineOptions(num_threads=num_threads, random_seed=seed)
-    with tempfile.TemporaryDirectory() as scratch, colmap_log(Path(scratch) / "mapper.log"):
-
-        def work() -> None:
-            if way != WAYS[2]:
-                models.extend(incremental_mapping(database, photos, options=ours))
-            else:
-                models.extend(pycolmap.incremental_mapping(database, photos, scratch, theirs).values())
-
-        begin_s = time.thread_time()
-        effort = effort_of(work)
-        caller_s, content = time.thread_time() - begin_s, hashlib.sha256()
-        for model in models:
-            model.write_binary(scratch)
-            for name in ("cameras.bin", "images.bin", "points3D.bin"):
-                content.update((Path(scratch) / name).read_bytes())
-    return Mapped(effort, caller_s, content.hexdigest())
-
-
-def compare_mappings(photos: Path, database: Path, num_threads: int, num_rounds: int, seed: int) -> None:
-    found: list[list[Mapped]] = [[] for _ in WAYS]
-    for _ in range(num_rounds):
-        for of_way, way in zip(found, WAYS, strict=True):
-            of_way.append(map_anew(photos, database, way, num_threads, seed))
-    print(f"{'mapping alone':25}{'clock':>9} {'processors':>10} {'caller':>9}   models ({load()})")
-    for of_way, way in zip(found, WAYS, strict=True):
-        clock_s = median(one.effort.clock_s for one in of_way)
-        processor_s, caller_s = median(one.effort.processor_s for one in of_way), median(one.caller_s for one in of_way)
-        line = f"{way:25}{clock_s:8.1f}s {processor_s:9.1f}s {caller_s:8.1f}s"
-        print(f"{line}   {len({one.content for one in of_way})} of {num_rounds}", flush=True)
-
-
-@contextmanager
-def on_cores(num: int) -> Iterator[None]:
-    """Restrict this thread, and the processes that it starts, to this number of cores."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(cores)[:num])
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
-
-
 def ratio(over: Sequence[float], under: Sequence[float]) -> str:
     ratios = [a / b for a, b in zip(over, under, strict=True)]
     return f"{median(ratios):5.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
@@ -268,36 +170,6 @@ def compare_stages(theirs: Sequence[Sequence[Effort]], ours: Sequence[Sequence[E
         print(f"{line}   {ratio(our_clock, clock)}   {ratio(our_processor, processor)}", flush=True)
 
 
-def compare_processes(
-    photos: Path, names: Sequence[str], features: Path, num_threads: int, num_rounds: int, seed: int
-) -> None:
-    all_cores = len(os.sched_getaffinity(0))
-    ways = [(1, 1), (1, all_cores), (num_threads, all_cores), (2 * num_threads, all_cores)]
-    spaces = [features.with_name(str(k)) for k in range(len(ways))]
-    for space in spaces:
-        space.mkdir()
-    databases = [Path(shutil.copy(features, space / "database.db")) for space in spaces]
-    efforts: list[list[Effort]] = [[] for _ in ways]
-    for _ in range(num_rounds):
-        for of_way, database, (num_processes, num_cores) in zip(efforts, databases, ways, strict=True):
-            with on_cores(num_cores):
-                of_way.append(match_anew(photos, names, database, num_processes, seed))
-    print(f"{'matching alone':32}{'clock':>9} {'processors':>10} {'busy':>5}   times as fast as the first ({load()})")
-    first = [effort.clock_s for effort in efforts[0]]
-    for (num_processes, num_cores), of_way in zip(ways, efforts, strict=True):
-        clock_s, processor_s, busy = (
-            median(getattr(effort, of) for effort in of_way) for of in ("clock_s", "processor_s", "num_busy_cores")
-        )
-        line = f"processes: {num_processes}, on cores: {num_cores:<9} {clock_s:8.1f}s {processor_s:9.1f}s {busy:5.2f}"
-        print(f"{line}   {ratio(first, [effort.clock_s for effort in of_way])}", flush=True)
-    several, one = ([effort.clock_s for effort in efforts[k]] for k in (2, 1))
-    contents = [content_of(database) for database in databases]
-    print(
-        f"{num_threads} processes beside one, all cores for both: {ratio(one, several)} times as fast; matches"
-        f" {'the same' if all(content == contents[0] for content in contents) else 'NOT THE SAME'}"
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", nargs="+", help="a folder, perhaps with :N for every Nth of its photos; or a survey")
@@ -307,7 +179,6 @@ def main() -> None:
     parser.add_argument("--camera_model")
     parser.add_argument("--camera_params", type=lambda text: tuple(map(float, text.split(","))))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("stages", "matching", "mapping"), help="one table (default: all)")
     arguments = parser.parse_args()
     camera = CameraOptions(model=arguments.camera_model, params=arguments.camera_params)
     num, seed = arguments.num_threads, arguments.seed
@@ -320,22 +191,14 @@ def main() -> None:
         photos = Path(folder)
         names = list_images(photos)[:: int(every_nth or 1)]
         print(f"\n{photos}: {len(names)} photos, {num} threads, {load()}", flush=True)
-        tables = [arguments.only] if arguments.only else ["stages", "matching", "mapping"]
-        programs = (by_pycolmap, by_rangesfm) if "stages" in tables else (by_rangesfm,)
-        efforts: dict[Any, list[list[Effort]]] = {run: [] for run in programs}
+        theirs, ours = list[list[Effort]](), list[list[Effort]]()
         with tempfile.TemporaryDirectory() as scratch:
-            for number in range(arguments.num_rounds if "stages" in tables else 1):
-                for run, found in efforts.items():
+            for number in range(arguments.num_rounds):
+                for run, found in ((by_pycolmap, theirs), (by_rangesfm, ours)):
                     output = Path(scratch) / f"{run.__name__}{number}"
                     output.mkdir()
                     found.append(run(photos, names, output, camera, num, seed))
-            database = Path(scratch) / "by_rangesfm0" / "database.db"
-            if "stages" in tables:
-                compare_stages(*(efforts[run] for run in programs))
-            if "matching" in tables:
-                compare_processes(photos, names, database, num, arguments.num_rounds, seed)
-            if "mapping" in tables:
-                compare_mappings(photos, database, num, arguments.num_rounds, seed)
+        compare_stages(theirs, ours)
 
 
 if __name__ == "__main__":
