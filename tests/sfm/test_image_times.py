@@ -100,7 +100,7 @@ class TestCsv:
         [
             ("", "images.csv: the file is empty"),
             ("image_name,timestamp_s\n", "images.csv: no rows below the header"),
-            ("image_name,size_px\na.jpg,1\n", "no columns with photos and times; found image_name, size_px"),
+            ("image_name,size_px\na.jpg,1\n", "no columns of photo times; found image_name, size_px"),
             (
                 "image_name,timestamp_s\na.jpg,noon\n",
                 "images.csv:2: timestamp_s is 'noon', expected a number",

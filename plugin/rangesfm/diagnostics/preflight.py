@@ -20,7 +20,8 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.mistakes.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
-from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, TABLE
+from rangesfm.measurements.ranges.readers.columns import CANONICAL
+from rangesfm.measurements.ranges.readers.table import MAPPED, TABLE
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
@@ -52,7 +53,7 @@ _MAX_SPOILT, _MIN_TRIANGLES = 0.3, 10
 # Most triangles that are checked, and most pairs or swaps that are named.
 _MAX_NUM_TRIANGLES, _MAX_NUM_NAMED = 20_000, 2
 # Formats of logs for which the user may give the unit of the ranges.
-_WITH_UNIT = (CANONICAL.name, MAPPED.name, TABLE.name)
+_WITH_UNIT = (CANONICAL, MAPPED.name, TABLE.name)
 # Units that are taken for metres.
 _UNITS = {"mm": "millimetres", "cm": "centimetres", "ft": "feet"}
 

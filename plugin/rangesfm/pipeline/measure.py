@@ -173,14 +173,13 @@ def read_point_pairs(path: Path) -> list[tuple[str, str]]:
     Raises:
         InputError: the file is not valid; the error gives the line.
     """
-    listed = PAIRS.read(path)
-    table = listed.table
+    table = PAIRS.read(path)
     if not len(table):
         raise InputError("holds no pair of points, expected one per line", path)
-    pairs = list(zip(listed.text("from"), listed.text("to"), strict=True))
+    pairs = list(zip(table.text("from"), table.text("to"), strict=True))
     for row, (first, second) in enumerate(pairs):
         if first == second:
-            raise table.error(row, listed.columns["to"], "another point than 'from'")
+            raise table.error(row, "to", "another point than 'from'")
     return pairs
 
 

@@ -165,10 +165,9 @@ def read_image_times_csv(
         InputError: with the line: a column is missing, a cell is not a time in seconds, a photo does not exist while
             one of ``names`` has no time, or a photo or a time appears twice.
     """
-    rows, times, resolutions_s = read_photo_list(path, columns=columns, unit=unit)
-    table = rows.table
+    table, times, resolutions_s = read_photo_list(path, columns=columns, unit=unit)
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
-    image_names = photos_meant(rows.text("image_name"), {*(names or ()), *frame_of})
+    image_names = photos_meant(table.text("image_name"), {*(names or ()), *frame_of})
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
     known, unknown = set(image_names), list[int]()
     if names is not None:
@@ -178,8 +177,7 @@ def read_image_times_csv(
         # If every photo has a time, the unknown names belong to photos that were removed. If one has none, an unknown
         # name is probably misspelt.
         if unknown and not all({name, *frames.get(name, ())} & timed for name in names):
-            column = rows.columns["image_name"]
-            raise table.error(unknown[0], column, f"the name of a photo in the folder, like '{names[0]}'")
+            raise table.error(unknown[0], "image_name", f"the name of a photo in the folder, like '{names[0]}'")
     stamps = {
         name: (time, resolution)
         for name, time, resolution in zip(image_names, times.tolist(), resolutions_s.tolist(), strict=True)
@@ -193,7 +191,7 @@ def read_image_times_csv(
     if unknown:
         num = f"{len(unknown)} of the {len(image_names)}"
         notes.append(f"{num} names in {table.path.name} belong to no photo in the folder")
-    return replace(ordered, notes=(*notes, *ordered.notes), assumed=rows.notes)
+    return replace(ordered, notes=(*notes, *ordered.notes), assumed=table.told)
 
 
 def _stamps_by_exif(folder: Path, names: Sequence[str]) -> dict[str, _Stamp]:

@@ -4,47 +4,38 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError, printable
-from rangesfm.measurements.ranges.readers.columns import read_timestamps
+from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_range, is_rising, named_photos
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import (
     Choice,
-    ListRows,
+    TableForm,
     UnclearListError,
-    columns_by_user,
     columns_flag,
-    layout_of_list,
-    read_canonical_rows,
-    read_rows,
+    times_by_row,
 )
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
 from rangesfm.options import TIME_S
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.text_tables import NO_NAMES, is_plain_table, read_head
+from rangesfm.util.files.text_tables import NO_NAMES, TextTable, read_head
 
-QUANTITIES = ("image_name", "timestamp", "date", "nanoseconds")
-_CANONICAL = {"image_name": "image_name", "timestamp": "timestamp_s"}
-_EXPECTED = f"expected a table with {','.join(_CANONICAL.values())}"
-# Largest plausible time between two photos; without a name, a time that may also be in a finer unit is asked for.
-_SLOWEST_S = 120.0
 _DECIMALS = re.compile(r"(?:^[-+]?\d*|:\d\d)[.,](\d+)", re.ASCII)
 
 
 def read_photo_list(
     path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None
-) -> tuple[ListRows, Array, Array]:
+) -> tuple[TextTable, Array, Array]:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
     Args:
-        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; empty:
+        columns: name of the column of each quantity (of PHOTO_TIMES), or its number in a table without names; empty:
             recognized.
         unit: unit of the times as in [ranges] timestamp_unit; None: by the column's name or the values.
 
@@ -56,29 +47,11 @@ def read_photo_list(
         InputError: a cell is not a time or a name. The error gives the line.
     """
     path = Path(path)
-    if not columns and unit is None and is_canonical_photo_list(read_head(path)):
-        rows = read_canonical_rows(path, _CANONICAL, [*_CANONICAL.values()])
-        return _with_resolution(rows, rows.table.numbers("timestamp_s", bounds=TIME_S), "s")
-    layout = layout_of_list(path, "photos and times", _EXPECTED)
-    needed = ("image_name", "timestamp")
-    taken = columns_by_user(columns, QUANTITIES, needed, layout, path) if columns else find_photo_columns(path, layout)
-    if taken is None:
-        found = printable(", ".join(layout.units))
-        raise InputError(f"no columns with photos and times; found {found}; {_EXPECTED}", path)
-    rows, notes = read_rows(path, layout, taken, of=()), list[str]()
-
-    def ask(units: Sequence[str], why: str) -> InputError:
-        choices = [Choice(f"if they are {one}", ("--image_times_unit", one)) for one in units]
-        return UnclearListError("photo times", path, layout, [f"the times have {why}"], choices)
-
-    times_s, unit = read_timestamps(rows.table, taken, layout.units, unit, notes, ask, slowest_s=_SLOWEST_S)
-    more = tuple(f"{path.name}: {note}" for note in notes)
-    return _with_resolution(replace(rows, notes=(*rows.notes, *more)), times_s, unit)
-
-
-def is_canonical_photo_list(head: str) -> bool:
-    """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
-    return is_plain_table(head, [*_CANONICAL.values()])
+    table = PHOTO_TIMES.read(path, columns)
+    if not columns and unit is None and PHOTO_TIMES.is_canonical(read_head(path)):
+        return _with_resolution(table, table.numbers("timestamp", bounds=TIME_S), "s")
+    times_s, unit, notes = times_by_row(table, PHOTO_TIMES.what, unit, "--image_times_unit")
+    return _with_resolution(replace(table, notes=(*table.notes, *notes)), times_s, unit)
 
 
 def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
@@ -109,14 +82,23 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     for one in photos:
         columns = {"image_name": one.name, **guess.columns}
         choices.append(Choice(f"if {one.name} is the photo", columns_flag("image_times_columns", columns)))
-    raise UnclearListError("photo times", path, layout, doubts, choices)
+    raise UnclearListError(PHOTO_TIMES.what, path, layout, doubts, choices)
 
 
-def _with_resolution(rows: ListRows, times_s: Array, unit: str) -> tuple[ListRows, Array, Array]:
-    if not len(rows.table):
-        raise InputError("no rows below the header, expected one per photo", rows.table.path)
-    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in rows.text("timestamp")]
+PHOTO_TIMES = TableForm(
+    "photo times",
+    {"image_name": "image_name", "timestamp": "timestamp_s"},
+    ("image_name", "timestamp"),
+    find_photo_columns,
+    also=("date", "nanoseconds"),
+)
+
+
+def _with_resolution(table: TextTable, times_s: Array, unit: str) -> tuple[TextTable, Array, Array]:
+    if not len(table):
+        raise InputError("no rows below the header, expected one per photo", table.path)
+    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in table.text("timestamp")]
     resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
-    if "nanoseconds" in rows.columns:
+    if "nanoseconds" in table:
         resolution_s[:] = SECONDS_PER_UNIT["ns"]
-    return rows, times_s, resolution_s
+    return table, times_s, resolution_s

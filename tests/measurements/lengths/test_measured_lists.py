@@ -87,12 +87,15 @@ def test_a_column_may_be_called_by_its_unit_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("from;to;raw distance;mean distance\nA;B;1,5;1,5\n", "no table of taped distances; found from, to, raw"),
-        ("from;to;speed\nA;B;1,5\n", "no table of taped distances; found from, to, speed; expected from,to,distance_m"),
+        ("from;to;raw distance;mean distance\nA;B;1,5;1,5\n", "no columns of taped distances; found from, to, raw"),
+        (
+            "from;to;speed\nA;B;1,5\n",
+            "no columns of taped distances; found from, to, speed; expected a table with from",
+        ),
         ("Von;Nach;Länge [m]\nA;B;1,5\nA;C;-2\n", "d.csv:3: Länge [m] is -2, expected a number of metres"),
         ("Von;Nach;Länge [mm]\nA;B;1500\nA;C;0\n", "d.csv:3: Länge [mm] is 0, expected a number of metres"),
-        ("just some words\n", "no table of taped distances, expected from,to,distance_m"),
-        ("", "the file is empty, expected from,to,distance_m"),
+        ("just some words\n", "no table of taped distances, expected a table with from,to,distance_m"),
+        ("", "the file is empty, expected a table with from,to,distance_m"),
     ],
 )
 def test_what_is_not_understood_is_refused_with_its_columns(text: str, said: str, tmp_path: Path) -> None:

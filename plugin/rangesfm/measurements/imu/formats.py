@@ -31,7 +31,7 @@ from rangesfm.measurements.imu.signals import (
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising
-from rangesfm.measurements.ranges.readers.layout import MISSING, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import Layout, find_layout
 from rangesfm.util.files.bags import is_bag, messages_of, open_bag, stamp_s, type_name
 from rangesfm.util.files.text_tables import TextTable, header_names, read_head, read_text
 
@@ -190,12 +190,12 @@ def _signals_of_table(path: Path, notes: list[str], *, may_be_none: bool) -> lis
         if may_be_none:
             return []
         raise InputError(f"no columns of a gyroscope and an accelerometer, {_EXPECTED}", path)
-    table, more = layout.read()
-    notes += [f"{path.name}: {note}" for note in more]
-    times_s = _times(layout, table, path, notes)
+    table = layout.read()
+    notes += table.told
+    times_s = _times(layout, table, notes)
     signals = []
     for triple in triples:
-        columns = [table.numbers(name, empty=np.nan, missing=MISSING) for name in triple.columns]
+        columns = [table.numbers(name, empty=np.nan) for name in triple.columns]
         kind, rank = triple.kind, triple.rank
         if not kind:
             kind, rank = kind_of_file(path.stem) or "", rank_of_file(path.stem)
@@ -228,7 +228,7 @@ def _of_values(signals: Sequence[_Signal], path: Path) -> list[_Signal]:
     return [replace(signal, kind=ACCEL if k == accel else GYRO) for k, signal in enumerate(signals)]
 
 
-def _times(layout: Layout, table: TextTable, path: Path, notes: list[str]) -> Array:
+def _times(layout: Layout, table: TextTable, notes: list[str]) -> Array:
     """Return the times (k,) of a table in seconds."""
     guess = Guess()
     if layout.has_names:
@@ -239,7 +239,7 @@ def _times(layout: Layout, table: TextTable, path: Path, notes: list[str]) -> Ar
         named = [column for column in layout.columns if {*column.words} & terms.TIME or not layout.has_names]
         rising = [column for column in named if is_rising(column)]
         if not rising:
-            raise InputError(f"no column seems to be the time, {_EXPECTED}", path)
+            raise InputError(f"no column seems to be the time, {_EXPECTED}", table.path)
         columns = {"timestamp": rising[0].name}
     told = list[str]()
 
@@ -247,11 +247,11 @@ def _times(layout: Layout, table: TextTable, path: Path, notes: list[str]) -> Ar
         return InputError(
             f"the times in {columns['timestamp']} may be in {' or '.join(units)} ({why}): name the column timestamp_s, "
             "timestamp_ms, timestamp_us or timestamp_ns",
-            path,
+            table.path,
         )
 
-    times_s, _ = read_timestamps(table, columns, layout.units, None, told, ask, slowest_s=_SLOWEST_STEP_S)
-    notes += [f"{path.name}: {note}" for note in told]
+    times_s, _ = read_timestamps(table.by_quantity(columns), None, told, ask, slowest_s=_SLOWEST_STEP_S)
+    notes += [f"{table.path.name}: {note}" for note in told]
     return times_s
 
 

@@ -3,69 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.layout import MISSING, ColumnSample, Layout, find_layout
-from rangesfm.measurements.ranges.readers.lists import ListRows, layout_of_list, read_canonical_rows, read_rows
-from rangesfm.util.files.text_tables import header_names, is_plain_table, read_head
+from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout
+from rangesfm.measurements.ranges.readers.lists import TableForm
+
+_Found = Mapping[str, Sequence[ColumnSample]]
+"""Columns that may hold each quantity."""
 
 
-@dataclass(frozen=True)
-class ListForm:
-    """A kind of list.
+def _form(
+    what: str,
+    required: Mapping[str, str],
+    optional: Mapping[str, str],
+    by_name: Callable[[Layout], _Found | None],
+    by_values: Callable[[Layout], _Found | None],
+) -> TableForm:
+    """Make a kind of list.
 
-    Attributes:
+    Args:
         what: what it lists, for messages.
         required, optional: columns of the canonical CSV, by quantity.
-        find: returns the columns that may hold each quantity by their names, or None if others say that it is no such
-            list.
+        by_name: returns the columns that may hold each quantity by their names, or None if others say that it is no
+            such list.
         by_values: the same for a table without names.
     """
 
-    what: str
-    required: Mapping[str, str]
-    optional: Mapping[str, str]
-    find: Callable[[Layout], dict[str, list[ColumnSample]] | None]
-    by_values: Callable[[Layout], dict[str, list[ColumnSample]] | None]
-
-    def read(self, path: Path) -> ListRows:
-        """Read a list.
-
-        Raises:
-            InputError: the file is no such list, or a line is not a row of the table.
-        """
-        if is_plain_table(read_head(path), self.required.values()):
-            rows = read_canonical_rows(path, {**self.required, **self.optional}, [*self.required.values()])
-            return replace(rows, missing=MISSING)
-        expected = f"expected {','.join(self.required.values())}"
-        layout = layout_of_list(path, self.what, expected)
-        found = (self.find if layout.has_names else self.by_values)(layout)
+    def find(path: Path, layout: Layout) -> dict[str, str] | None:
+        found = (by_name if layout.has_names else by_values)(layout)
         if found is None:
-            raise InputError(f"no table of {self.what}; found {printable(', '.join(layout.units))}; {expected}", path)
-        for quantity in self.required:
+            return None
+        for quantity, name in required.items():
             if (num := len(those := found.get(quantity, []))) != 1:
                 which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
-                listed = printable(", ".join(layout.units))
-                message = f"a table of {self.what} in which {which} {self.required[quantity]}; found {listed}"
-                raise InputError(f"{message}; {expected}", path)
-        columns = _single(found)
-        return read_rows(path, layout, columns, of=[quantity for quantity in ("distance",) if quantity in columns])
+                listed = printable(", ".join(layout.names))
+                message = f"a table of {what} in which {which} {name}; found {listed}"
+                raise InputError(f"{message}; {form.expected}", path)
+        return {quantity: those[0].name for quantity, those in found.items() if len(those) == 1}
 
-    def is_such(self, path: Path) -> bool:
-        """Return whether a file is such a list by the names of its columns."""
-        names = {*header_names(read_head(path))}
-        if names >= {*self.required.values()}:
-            return not self.optional or names <= {*self.required.values(), *self.optional.values()}
-        layout = find_layout(path)
-        found = self.find(layout) if layout is not None and layout.has_names else None
-        return found is not None and self.required.keys() <= _single(found).keys()
-
-
-def _single(found: Mapping[str, Sequence[ColumnSample]]) -> dict[str, str]:
-    return {quantity: those[0].name for quantity, those in found.items() if len(those) == 1}
+    form = TableForm(what, {**required, **optional}, tuple(required), find)
+    return form
 
 
 def _ends(columns: Sequence[ColumnSample]) -> tuple[list[ColumnSample], list[ColumnSample]]:
@@ -83,7 +62,7 @@ def _ends(columns: Sequence[ColumnSample]) -> tuple[list[ColumnSample], list[Col
     return (texts[:1], texts[1:]) if len(texts) == 2 else ([], [])
 
 
-def _lengths_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+def _lengths_by_name(layout: Layout) -> _Found | None:
     of: dict[str, list[ColumnSample]] = {"distance": [], "stddev": [], "kind": []}
     others = []
     for column in layout.columns:
@@ -105,14 +84,14 @@ def _lengths_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
     return {"from": start, "to": end, **of}
 
 
-def _lengths_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+def _lengths_by_value(layout: Layout) -> _Found | None:
     kinds = [column.kind for column in layout.columns]
     if kinds[2:] not in (["numbers"], ["numbers", "numbers"]):
         return None
     return dict(zip(("from", "to", "distance", "stddev"), ([column] for column in layout.columns)))
 
 
-def _marks_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+def _marks_by_name(layout: Layout) -> _Found | None:
     of: dict[str, list[ColumnSample]] = {"marker": [], "image_name": [], "x": [], "y": []}
     for column in layout.columns:
         words = {*column.words}
@@ -127,7 +106,7 @@ def _marks_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
     return of
 
 
-def _marks_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+def _marks_by_value(layout: Layout) -> _Found | None:
     photos = [column for column in layout.columns if column.names_photos]
     numbers = [column for column in layout.columns if column.kind == "numbers"]
     others = [column for column in layout.columns if column not in (*photos, *numbers)]
@@ -138,21 +117,21 @@ def _marks_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
 
 
 _ENDS = {"from": "from", "to": "to"}
-LENGTHS = ListForm(
+LENGTHS = _form(
     "taped distances",
     {**_ENDS, "distance": "distance_m"},
     {"stddev": "stddev_m", "kind": "kind"},
     _lengths_by_name,
     _lengths_by_value,
 )
-PAIRS = ListForm(
+PAIRS = _form(
     "pairs of points",
     _ENDS,
     {},
     lambda layout: dict(zip(_ENDS, _ends(layout.columns))),
     lambda layout: dict(zip(_ENDS, ([column] for column in layout.columns))),
 )
-MARKS = ListForm(
+MARKS = _form(
     "marks in photos",
     {"marker": "marker", "image_name": "image_name", "x": "x_px", "y": "y_px"},
     {},

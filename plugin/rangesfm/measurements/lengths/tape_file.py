@@ -12,11 +12,11 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
 from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
 from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Mark, Marker, Tape, TapedDistance
-from rangesfm.measurements.ranges.readers.lists import ListRows
+from rangesfm.measurements.ranges.readers.lists import metres
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.photo_names import photos_meant
-from rangesfm.util.files.text_tables import read_head, repeated
+from rangesfm.util.files.text_tables import TextTable, read_head, repeated
 
 # Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
@@ -30,23 +30,22 @@ def read_tape(path: AnyPath) -> Tape:
     Raises:
         InputError: the file is not valid; the error gives the line.
     """
-    listed = LENGTHS.read(Path(path))
-    return Tape(_distances(listed), distances_path=Path(path), notes=listed.notes)
+    table = LENGTHS.read(Path(path))
+    return Tape(_distances(table), distances_path=Path(path), notes=table.told)
 
 
-def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:
-    table = listed.table
+def _distances(table: TextTable) -> tuple[TapedDistance, ...]:
     if not len(table):
         raise InputError("holds no distance, expected one per line", table.path)
-    starts, ends = listed.text("from"), listed.text("to")
-    kinds = [kind.lower() for kind in listed.text("kind", CONTROL)]
+    starts, ends = table.text("from"), table.text("to")
+    kinds = [kind.lower() for kind in table.text("kind", empty=CONTROL)]
     for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):
         if start == end:
-            raise table.error(row, listed.columns["to"], "another end than 'from'")
+            raise table.error(row, "to", "another end than 'from'")
         if kind not in (CONTROL, CHECK):
-            raise table.error(row, listed.columns["kind"], f"{CONTROL} or {CHECK}")
-    lengths = listed.metres("distance", LENGTH_M)
-    stddevs = listed.metres("stddev", STDDEV_M, DEFAULT_STDDEV_M)
+            raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
+    lengths = metres(table, "distance", LENGTH_M)
+    stddevs = metres(table, "stddev", STDDEV_M, DEFAULT_STDDEV_M)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
@@ -63,11 +62,11 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
     """
     if is_metashape_file(read_head(path)):
         return markers_of_marks(read_metashape_markers(Path(path)).seen, Path(path), stddev_px)
-    listed = MARKS.read(Path(path))
-    pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
+    table = MARKS.read(Path(path))
+    pixels = np.column_stack([table.numbers(axis, bounds=PIXEL) for axis in ("x", "y")])
     seen: dict[str, list[Mark]] = {}
-    rows = zip(listed.text("image_name"), pixels.tolist(), listed.table.line.tolist(), strict=True)
-    for name, mark in zip(listed.text("marker"), rows, strict=True):
+    rows = zip(table.text("image_name"), pixels.tolist(), table.line.tolist(), strict=True)
+    for name, mark in zip(table.text("marker"), rows, strict=True):
         seen.setdefault(name, []).append(mark)
     return markers_of_marks(seen, Path(path), stddev_px)
 

@@ -13,26 +13,14 @@ from rangesfm.measurements.lengths.tape import CHECK, CONTROL, Mark
 from rangesfm.measurements.lengths.tape_file import markers_of_marks
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_log import crs_in_text, crs_of_line
-from rangesfm.measurements.ranges.anchors.anchor_file import find_anchor_columns, like_anchors
+from rangesfm.measurements.ranges.anchors.anchor_file import find_or_ask
 from rangesfm.measurements.ranges.readers.layout import Layout
-from rangesfm.measurements.ranges.readers.lists import (
-    AXES,
-    ListRows,
-    UnclearListError,
-    columns_by_user,
-    layout_of_list,
-    read_canonical_rows,
-    read_rows,
-)
+from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, UnclearListError, metres
 from rangesfm.measurements.ranges.readers.vocabulary import KIND
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
-from rangesfm.util.files.text_tables import has_columns, is_number, is_plain_table, read_head, read_text, repeated
+from rangesfm.util.files.text_tables import TextTable, is_number, read_head, read_text, repeated
 
-POINT_COLUMNS = ("marker", "x_m", "y_m", "z_m")
-_CANONICAL = {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"}
-QUANTITIES = tuple(_CANONICAL)
 _KINDS = (CONTROL, CHECK)
-_EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
 _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
 
 
@@ -52,8 +40,11 @@ def read_control_points(options: PointOptions) -> ControlPoints:
     if path is None:
         return ControlPoints()
     head = read_head(path)
-    read = _gcp_list if is_gcp_list(head) else _metashape if is_metashape_file(head) else _table
-    return read(path, options, head)
+    if is_gcp_list(head):
+        return _gcp_list(path, options)
+    if is_metashape_file(head):
+        return _metashape(path, options)
+    return _points(POINTS.read(path, options.columns, options.unit), options)
 
 
 def is_gcp_list(head: str) -> bool:
@@ -66,33 +57,19 @@ def is_gcp_list(head: str) -> bool:
 
 def is_point_file(head: str) -> bool:
     """Return whether a file with this beginning holds coordinates of marks."""
-    return has_columns(head, POINT_COLUMNS) or is_gcp_list(head)
+    return POINTS.has_usual_names(head) or is_gcp_list(head)
 
 
-def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
-    if not options.columns and options.unit is None and is_plain_table(head, POINT_COLUMNS):
-        return _points(read_canonical_rows(path, _CANONICAL, POINT_COLUMNS), options)
-    layout = layout_of_list(path, "points", _EXPECTED)
-    columns = (
-        columns_by_user(options.columns, QUANTITIES, ("marker", *AXES), layout, path)
-        if options.columns
-        else _found_columns(path, layout, head)
-    )
-    return _points(read_rows(path, layout, columns, options.unit), options)
-
-
-def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
+def _find_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     """Return the name of the column of each quantity: as in the canonical CSV, else recognized as in one of anchors."""
-    if has_columns(head, POINT_COLUMNS):
-        return {quantity: name for quantity, name in _CANONICAL.items() if name in layout.units}
+    if {POINTS.names[quantity] for quantity in POINTS.required} <= {*layout.names}:
+        return {quantity: name for quantity, name in POINTS.names.items() if name in layout.names}
     try:
-        found = find_anchor_columns(path, layout)
-        if found is None and (unclear := like_anchors(path)) is not None:
-            raise unclear
+        found = find_or_ask(path, layout)
     except UnclearListError as error:
         raise error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"}) from None
     if found is None:
-        raise InputError(f"no columns of points; found {', '.join(layout.units)}; {_EXPECTED}", path)
+        return None
     own = {"anchor_id": "marker", "position_stddev": "stddev"}
     columns = {own.get(quantity, quantity): name for quantity, name in found.items() if "bias" not in quantity}
     kinds = [
@@ -103,24 +80,31 @@ def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
     return columns | ({"kind": kinds[0]} if len(kinds) == 1 else {})
 
 
-def _points(rows: ListRows, options: PointOptions) -> ControlPoints:
-    table = rows.table
+POINTS = TableForm(
+    "points",
+    {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"},
+    ("marker", *AXES),
+    _find_columns,
+)
+
+
+def _points(table: TextTable, options: PointOptions) -> ControlPoints:
     if not len(table):
         raise InputError("names no point, expected one per line", table.path)
-    markers = rows.text("marker")
+    markers = table.text("marker")
     if again := repeated(markers):
-        raise table.error(again[0], rows.columns["marker"], "each point once")
-    positions = np.column_stack([rows.metres(axis, COORDINATE_M) for axis in AXES])
-    stddevs = rows.metres("stddev", STDDEV_M, options.stddev_m)
-    kinds = [kind.lower() for kind in rows.text("kind", CONTROL)]
+        raise table.error(again[0], "marker", "each point once")
+    positions = np.column_stack([metres(table, axis, COORDINATE_M) for axis in AXES])
+    stddevs = metres(table, "stddev", STDDEV_M, options.stddev_m)
+    kinds = [kind.lower() for kind in table.text("kind", empty=CONTROL)]
     if (wrong := np.array([kind not in _KINDS for kind in kinds])).any():
-        table.refuse(wrong, rows.columns["kind"], f"{CONTROL} or {CHECK}")
+        table.refuse(wrong, "kind", f"{CONTROL} or {CHECK}")
     each = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     points = tuple(ControlPoint(*row) for row in each)
-    return ControlPoints(points, {}, "stddev" in rows.columns, "", table.path, rows.notes)
+    return ControlPoints(points, {}, "stddev" in table, "", table.path, table.told)
 
 
-def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
+def _gcp_list(path: Path, options: PointOptions) -> ControlPoints:
     """Read ODM's ``gcp_list.txt``: the coordinate system, then lines of a point and its pixel in one photo.
 
     A point without a name is known by its coordinates.
@@ -145,7 +129,7 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
     return ControlPoints(tuple(points.values()), markers_of_marks(marks, path), False, crs, path)
 
 
-def _metashape(path: Path, options: PointOptions, _head: str) -> ControlPoints:
+def _metashape(path: Path, options: PointOptions) -> ControlPoints:
     """Read Metashape's markers; those whose coordinates are not enabled are check points, as there."""
     read = read_metashape_markers(path)
     points = tuple(

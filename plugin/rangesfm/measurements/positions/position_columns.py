@@ -34,8 +34,8 @@ _KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
 
 
-def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], list[str]]:
-    """Return the name of the column of each quantity, and lines for the user about them.
+def find_position_columns(path: Path, layout: Layout) -> dict[str, str]:
+    """Return the name of the column of each quantity.
 
     Raises:
         UnclearListError: it may be several; the advice has a command for each.
@@ -49,7 +49,7 @@ def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], l
     elif not photos and (rising := [column for column in free if column.kind == "times" or is_rising(column)]):
         guess.columns["timestamp"] = rising[0].name
     if photos:
-        guess.columns, guess.notes = {"image_name": photos[0].name}, []
+        guess.columns = {"image_name": photos[0].name}
     free = [column for column in free if column.name not in guess.columns.values()]
     axes = (_axes_by_name if layout.has_names else _axes_by_values)(free, guess)
     if not _KEYS & guess.columns.keys():
@@ -57,7 +57,7 @@ def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], l
     _add_errors(free, guess.columns)
     if guess.doubts:
         raise UnclearListError("positions", path, layout, guess.doubts, [*_choices(free, guess.columns, axes)])
-    return guess.columns, guess.notes
+    return guess.columns
 
 
 def is_degrees(name: str, axis: str) -> bool:
@@ -126,7 +126,6 @@ def _axes_by_values(free: Sequence[ColumnSample], found: Guess) -> dict[str, dic
     largest = max(float(np.abs(column.numbers).max(initial=0.0)) for column in places)
     if before or not (largest > LOCAL_M or _may_be_degrees(places)):
         found.columns |= east_first
-        found.notes.append(f"the table has no names: columns {', '.join(names)} are taken as x, y, z")
         return {}
     found.doubts.append("a table without names, in which either x (east, longitude) or y may come first")
     return {

@@ -19,7 +19,6 @@ from rangesfm.errors import InputError, nearest_known, printable
 from rangesfm.measurements.positions.pose_priors import is_database, read_pose_priors
 from rangesfm.measurements.positions.position_columns import (
     COVARIANCES,
-    QUANTITIES,
     STDDEVS,
     find_position_columns,
     is_degrees,
@@ -27,43 +26,35 @@ from rangesfm.measurements.positions.position_columns import (
 from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.layout import MISSING
-from rangesfm.measurements.ranges.readers.lists import (
-    AXES,
-    Choice,
-    UnclearListError,
-    columns_by_user,
-    layout_of_list,
-    length_units,
-)
+from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, metres, times_by_row
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
 from rangesfm.util.files.text_tables import (
-    FOUND,
     TextTable,
-    has_columns,
     header_names,
     is_number,
     read_head,
-    read_table,
     read_text,
 )
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
 
-_CANONICAL = {
-    "timestamp": "timestamp_s",
-    "image_name": "image_name",
-    **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
-    **{name: f"{name}_m2" for name in COVARIANCES},
-    "quality": "quality",
-}
-POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in AXES)
-_EXPECTED = f"expected a table with timestamp_s or image_name, and {','.join(POSITION_COLUMNS)}"
+_POSITIONS = TableForm(
+    "positions",
+    {
+        "timestamp": "timestamp_s",
+        "image_name": "image_name",
+        **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
+        **{name: f"{name}_m2" for name in COVARIANCES},
+        "quality": "quality",
+    },
+    ("timestamp or image_name", *AXES),
+    find_position_columns,
+    also=("date", "nanoseconds", "tag_id"),
+)
 DEGREES = Bounds(-360, 360, "degrees")
-_SLOWEST_S = 120.0
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
 _SECONDS_OF_DAY = 86400.0
 AUTONOMOUS_STDDEV_M = 3.0
@@ -103,70 +94,31 @@ def is_of_positions(head: str) -> bool:
     return _is_nmea(head) or _is_rtklib(head) or _is_odm(head)
 
 
-def _is_canonical(head: str) -> bool:
-    return any(has_columns(head, [_CANONICAL[key], *POSITION_COLUMNS]) for key in ("timestamp", "image_name"))
-
-
-def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
-    if options.columns or options.unit or options.timestamp_unit or not _is_canonical(read_head(path)):
-        return _read_table(path, options)
-    key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
-    optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
-    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, separator=FOUND)
-    names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
-    is_timed = key == "timestamp"
-    moments = ByTime(table.numbers(names[key], bounds=TIME_S)) if is_timed else ByPhoto(tuple(table.text(names[key])))
-    return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), moments, path, [], options)
-
-
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
-    layout = layout_of_list(path, "positions", _EXPECTED)
-    columns, notes = (
-        (columns_by_user(options.columns, QUANTITIES, (*AXES, "timestamp or image_name"), layout, path), [])
-        if options.columns
-        else find_position_columns(path, layout)
-    )
-    table, more = layout.read()
-    notes += more
-    if "timestamp" in columns:
-
-        def ask(units: Sequence[str], why: str) -> InputError:
-            choices = [Choice(f"if they are {one}", ("--position_time_unit", one)) for one in units]
-            return UnclearListError("positions", path, layout, [f"the times have {why}"], choices)
-
-        said = options.timestamp_unit
-        times_s, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
-        moments: Moments = ByTime(times_s)
+    head = read_head(path)
+    table = _POSITIONS.read(path, options.columns, options.unit, every_row=False)
+    notes = [*table.notes]
+    if "timestamp" not in table:
+        moments: Moments = ByPhoto(tuple(table.text("image_name")))
+    elif not (options.columns or options.unit or options.timestamp_unit) and _POSITIONS.is_canonical(head):
+        moments = ByTime(table.numbers("timestamp", bounds=TIME_S))
     else:
-        moments = ByPhoto(tuple(table.text(columns["image_name"])))
-    units, more = length_units(layout, columns, options.unit)
-    return _log_of_table(table, columns, units, moments, path, [*notes, *more], options)
-
-
-def _log_of_table(
-    table: TextTable,
-    names: Mapping[str, str],
-    units: Mapping[str, str],
-    moments: Moments,
-    path: Path,
-    notes: list[str],
-    options: PositionOptions,
-) -> PositionLog:
-    """Return the log of a table, given the column and the unit of each quantity."""
-    crs = crs_in_head(read_head(path))
-    kept = _of_one_tag(table, names, options.tag_id, path)
-    columns = [table.numbers(names[axis], empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
-    are_degrees = not (crs or options.crs) and options.unit is None and _are_degrees(names, columns)
+        times_s, _, more = times_by_row(table, _POSITIONS.what, options.timestamp_unit, "--position_time_unit")
+        moments, notes = ByTime(times_s), [*notes, *more]
+    crs = crs_in_head(head)
+    kept = _of_one_tag(table, options.tag_id)
+    columns = [table.numbers(axis, empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
+    are_degrees = not (crs or options.crs) and options.unit is None and _are_degrees(table.names, columns)
     bounds = {axis: DEGREES if are_degrees and axis != "z" else COORDINATE_M for axis in AXES}
     for k, axis in enumerate(AXES):
-        columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[units[axis]]
-        table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), names[axis], str(bounds[axis]))
+        columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[table.units[axis] or "m"]
+        table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), axis, str(bounds[axis]))
     position = np.column_stack(columns)
     is_lost = np.zeros(len(table), dtype=bool)
     if are_degrees or crs:  # receivers without a fix write zeros, which is in the Atlantic
         is_lost |= (position[:, 0] == 0) & (position[:, 1] == 0)
-    if "quality" in names:
-        is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
+    if "quality" in table:
+        is_lost |= table.numbers("quality", empty=0.0, missing=MISSING) == 0
     position[is_lost] = np.nan
     log = PositionLog.in_time_order(
         path,
@@ -174,7 +126,7 @@ def _log_of_table(
         position[kept],
         moments.subset(np.flatnonzero(kept)),
         table.line[kept],
-        covariance_m2=_covariances(table, names, units)[kept],
+        covariance_m2=_covariances(table)[kept],
         notes=notes,
     )
     return replace(log, crs=GEOGRAPHIC if are_degrees else crs)
@@ -193,35 +145,34 @@ def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
     return all(len(values) > 0 and float(np.ptp(values)) < WIDEST_DEG for values in known)
 
 
-def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str, path: Path) -> Mask:
+def _of_one_tag(table: TextTable, tag_id: str) -> Mask:
     """Return which rows (n,) are of the wanted tag."""
-    if "tag_id" not in names:
+    if "tag_id" not in table:
         return np.ones(len(table), dtype=bool)
-    ids = np.array(table.text(names["tag_id"], empty=""), dtype=str)
+    ids = np.array(table.text("tag_id", empty=""), dtype=str)
     found = sorted(set(ids.tolist()))
     if not tag_id and len(found) > 1:
         raise InputError(
-            f"has positions of several tags ({', '.join(found)}): say which it is (--position_tag_id)", path
+            f"has positions of several tags ({', '.join(found)}): say which it is (--position_tag_id)", table.path
         )
     if tag_id and tag_id not in found:
-        raise InputError(f"has no position of tag {tag_id!r}, found {', '.join(found)}", path)
+        raise InputError(f"has no position of tag {tag_id!r}, found {', '.join(found)}", table.path)
     return np.asarray(ids == (tag_id or found[0]))
 
 
-def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str, str]) -> Array:
+def _covariances(table: TextTable) -> Array:
     """Return (n, 3, 3) covariances, NaN where the table has none: as a matrix, by axis, or of any coordinate."""
     covariances = np.full((len(table), 3, 3), np.nan)
-    if set(COVARIANCES) <= names.keys():
+    if set(COVARIANCES) <= table.cells.keys():
         rows, columns = np.triu_indices(3)
         for name, i, j in zip(COVARIANCES, rows, columns, strict=True):
-            covariances[:, i, j] = covariances[:, j, i] = table.numbers(names[name], empty=np.nan)
+            covariances[:, i, j] = covariances[:, j, i] = table.numbers(name, empty=np.nan)
         is_valid = np.isnan(covariances).any(axis=(1, 2)) | (np.linalg.eigvalsh(np.nan_to_num(covariances))[:, 0] > 0)
-        table.refuse(~is_valid, names["cov_xx"], "a positive definite covariance")
+        table.refuse(~is_valid, "cov_xx", "a positive definite covariance")
         return covariances
     for axis, own in enumerate(STDDEVS):
-        if (name := own if own in names else "stddev") in names:
-            stddev = table.numbers(names[name], empty=np.nan) / UNITS_PER_METRE[units[name]]
-            table.refuse(~(np.isnan(stddev) | STDDEV_M.hold(stddev)), names[name], f"{STDDEV_M}, or nothing")
+        if (name := own if own in table else "stddev") in table:
+            stddev = metres(table, name, STDDEV_M, np.nan)
             covariances[:, axis] = 0.0
             covariances[:, axis, axis] = stddev**2
     covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
@@ -234,7 +185,7 @@ def _is_tum(head: str) -> bool:
 
 def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
     table = tum_table(path)
-    times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
+    times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in [*table.cells][:4])
     at_m, unknown_m2 = np.column_stack(places), np.full((len(table), 3, 3), np.nan)
     return PositionLog.in_time_order(path, "tum", at_m, ByTime(times_s), table.line, covariance_m2=unknown_m2)
 
@@ -481,6 +432,6 @@ POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "odm": (_is_odm, _read_odm),
     "tum": (_is_tum, _read_tum),
     "marvelmind": (_is_marvelmind, _read_marvelmind),
-    "table": (_is_canonical, _read_canonical),
+    "table": (_POSITIONS.is_canonical, _read_table),
 }
 """Formats by name: whether a file begins like one, and its reader."""

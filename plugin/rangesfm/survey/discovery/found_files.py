@@ -10,7 +10,6 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 from rangesfm.errors import InputError
@@ -36,7 +35,7 @@ from rangesfm.survey.sources.bag import has_images
 from rangesfm.survey.sources.source import is_video
 from rangesfm.util.files.bags import is_bag, is_bag_folder
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
-from rangesfm.util.files.text_tables import has_columns, header_names, read_head
+from rangesfm.util.files.text_tables import header_names, read_head
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row
 
 PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
@@ -68,12 +67,12 @@ _TABLE_EXTENSIONS = (
 )
 # Tables that are recognised by their header row, after it is known that the file is not a log.
 _TABLES: dict[str, Callable[[str], bool]] = {
-    "scale.distances": partial(has_columns, required=LENGTHS.required.values()),
+    "scale.distances": LENGTHS.has_usual_names,
     POINTS: is_point_file,
     "ranges.error_curve": is_error_curve_file,
     REFERENCE: is_reference_file,
-    ANCHORS: anchor_file.is_canonical_anchor_file,
-    TIMES: photo_list.is_canonical_photo_list,
+    ANCHORS: anchor_file.ANCHORS.is_canonical,
+    TIMES: photo_list.PHOTO_TIMES.is_canonical,
 }
 # Lists in tables of any layout: how their columns are found, and how they are read.
 _LISTS: dict[str, tuple[Callable[[Path, Layout], object], Callable[[Path], object]]] = {
@@ -260,7 +259,7 @@ def _positions_of(path: Path) -> str | None:
         return None
     on_earth = all(any(is_degrees(column.name, axis) for column in layout.columns) for axis in ("x", "y"))
     try:
-        columns, _ = find_position_columns(path, layout)
+        columns = find_position_columns(path, layout)
     except UnclearListError:
         if on_earth:
             raise

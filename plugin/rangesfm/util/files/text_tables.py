@@ -17,7 +17,7 @@ import os
 import re
 import zlib
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from pathlib import Path
 from types import MappingProxyType
@@ -52,18 +52,24 @@ _WINDOWS_SIGNS = "\xb0\xb2\xb3\xb5\xb1\xa7\xb7\xa0\u20ac\u2018\u2019\u201c\u201d
 
 @dataclass(frozen=True)
 class TextTable:
-    """The requested columns of a file, n rows.
+    """Columns of a file, n rows. A column is called by its name in the file, or by the quantity that it holds.
 
     Attributes:
-        columns: all names of the header row, in order.
         line: (n,) 1-based line of each row.
-        cells: the cells of each requested column that the file has.
+        cells: the cells of each column.
+        names: the name in the file of each column that is called by its quantity.
+        units: the unit of the numbers of each column, where it is not a part of its name.
+        missing: texts of a cell, in small letters, that counts as empty.
+        notes: lines for the user about how the file was read.
     """
 
     path: Path
-    columns: tuple[str, ...]
     line: npt.NDArray[np.int64]
     cells: Mapping[str, list[str]]
+    names: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    missing: Collection[str] = ("",)
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.line)
@@ -71,13 +77,34 @@ class TextTable:
     def where(self, chosen: Sequence[bool]) -> TextTable:
         """Return the table with the rows that are true in ``chosen``."""
         cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
-        return TextTable(self.path, self.columns, self.line[np.array(chosen)], cells)
+        return replace(self, line=self.line[np.array(chosen)], cells=cells)
+
+    def by_quantity(self, columns: Mapping[str, str]) -> TextTable:
+        """Return the table with columns by quantity, given the name of each; those that the file lacks are left out."""
+        names = {quantity: name for quantity, name in columns.items() if name in self}
+        cells = {quantity: self.cells[name] for quantity, name in names.items()}
+        units = {quantity: self.units.get(name, "") for quantity, name in names.items()}
+        return replace(self, cells=cells, names=names, units=units)
 
     def __contains__(self, column: str) -> bool:
         return column in self.cells
 
+    def heading(self, column: str) -> str:
+        """Return the name of a column in the file and its unit."""
+        return f"{self.names.get(column, column)} {self.units.get(column, '')}".strip()
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """The notes, each with the name of the file."""
+        return tuple(f"{self.path.name}: {note}" for note in self.notes)
+
     def text(self, column: str, *, empty: str | None = None) -> list[str]:
-        """Return the cells without surrounding blanks; ``empty`` replaces empty cells, and None refuses them."""
+        """Return the cells without surrounding blanks.
+
+        ``empty`` replaces empty cells and a missing column; None refuses them.
+        """
+        if column not in self and empty is not None:
+            return [empty] * len(self)
         texts = [_without_mark(cell.strip()) for cell in self.cells[column]]
         if "" in texts:
             if empty is None:
@@ -104,7 +131,7 @@ class TextTable:
         column: str,
         *,
         empty: float | None = None,
-        missing: Collection[str] = ("",),
+        missing: Collection[str] = (),
         bounds: Bounds = A_NUMBER,
         expected: str = "",
     ) -> npt.NDArray[np.float64]:
@@ -112,7 +139,7 @@ class TextTable:
 
         Args:
             empty: value of empty cells and of a missing column; if it is None, empty cells are refused.
-            missing: texts of a cell that counts as empty, in small letters.
+            missing: texts of a cell that counts as empty, beside those of the table.
             bounds: bounds of valid numbers; A_NUMBER: every number that can be squared.
             expected: description of a valid cell, for messages; empty: by the bounds.
 
@@ -127,7 +154,7 @@ class TextTable:
         values = np.array(list(map(_number, cells)), np.float64)
         bad = np.flatnonzero(~np.isfinite(values)).tolist()
         for row in bad:
-            if empty is None or cells[row].strip().lower() not in missing:
+            if empty is None or cells[row].strip().lower() not in (*self.missing, *missing):
                 raise self.error(row, column, expected)
             values[row] = empty
         wrong = ~bounds.hold(values)
@@ -139,7 +166,8 @@ class TextTable:
         """Return the error that says what is in ``column`` of the 0-based ``row``, and what was expected."""
         cell = self.cells[column][row].strip()
         found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
-        return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
+        name = self.names.get(column, column)
+        return InputError(f"{name} is {found}, expected {expected}", self.path, int(self.line[row]))
 
     def refuse(self, wrong: npt.NDArray[np.bool_], column: str, expected: str) -> None:
         """Raise the error of the first row that is true in ``wrong`` (n,), if there is one."""
@@ -191,7 +219,7 @@ def read_table(
         lines.append(line)
         for name, index in wanted.items():
             columns[name].append(cells[index])
-    return TextTable(path, tuple(names), np.array(lines, dtype=np.int64), columns)
+    return TextTable(path, np.array(lines, dtype=np.int64), columns)
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -214,7 +214,7 @@ def tum_table(path: Path) -> TextTable:
             raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
     lines = np.array([line for line, _ in rows], dtype=np.int64)
     by_name = {name: [row[i] for _, row in rows] for i, name in enumerate(columns)}
-    return TextTable(path, columns, lines, {**by_name, columns[0]: _in_seconds(by_name[columns[0]])})
+    return TextTable(path, lines, {**by_name, columns[0]: _in_seconds(by_name[columns[0]])})
 
 
 def _in_seconds(cells: list[str]) -> list[str]:

@@ -171,7 +171,7 @@ def test_a_table_without_names_is_taken_as_x_y_z_and_that_is_told_unless_columns
     path = table(tmp_path, ROWS[1:])
     found = read_anchor_list(path)
     np.testing.assert_array_equal(known(found[0][1].position_m), [4.5, 5.5, 6.5])
-    assert found[1][-1] == "points.csv: the table has no names: its numbers are taken as x, y, z"
+    assert "x = 2, y = 3, z = 4 (by their numbers and values: the table has no names)" in found[1][0]
     typed = read_anchor_list(path, columns={"z": "2", "x": "3", "y": "4", "anchor_id": "1"})
     np.testing.assert_array_equal(known(typed[0][1].position_m), [5.5, 6.5, 4.5])
     assert typed[1] == ("points.csv: columns taken: anchor_id = 1, x = 3, y = 4, z = 2",)

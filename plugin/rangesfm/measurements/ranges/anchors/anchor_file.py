@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.errors import InputError, printable
+from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
@@ -15,30 +15,20 @@ from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, fi
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
     Choice,
-    ListRows,
+    TableForm,
     UnclearListError,
-    columns_by_user,
     columns_flag,
     coordinates_of_point,
-    layout_of_list,
-    read_canonical_rows,
-    read_rows,
+    metres,
     ways_to_complete,
 )
 from rangesfm.measurements.ranges.readers.units import named_length_unit
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.text_tables import is_plain_table, read_head, repeated, write_user_table
+from rangesfm.util.files.text_tables import NO_NAMES, TextTable, repeated, write_user_table
 
 WHAT = "anchors"
 QUANTITIES = ("anchor_id", "x", "y", "z", "position_stddev", "range_bias", "range_bias_stddev")
-_CANONICAL = {
-    quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES
-}  # names in the canonical CSV
-_REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *AXES))
-_ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
-_EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
-_BY_ORDER = "the table has no names: its numbers are taken as x, y, z"
 _GEOGRAPHIC = "EPSG:4979"
 # Coordinates beyond this, metres, are not local but those of a surveyed grid.
 LOCAL_M = 500.0
@@ -74,25 +64,8 @@ def read_anchor_list(
         InputError: an anchor appears twice, a position is incomplete, or a cell is not a number. The error gives the
             line.
     """
-    path = Path(path)
-    if not columns and unit is None and is_canonical_anchor_file(read_head(path)):
-        return _anchors(read_canonical_rows(path, _CANONICAL, _REQUIRED, _ALIASES)), ()
-    layout = layout_of_list(path, WHAT, _EXPECTED)
-    needed = ("anchor_id", *AXES)
-    taken = columns_by_user(columns, QUANTITIES, needed, layout, path) if columns else find_anchor_columns(path, layout)
-    if taken is None:
-        if (unclear := like_anchors(path)) is not None:
-            raise unclear
-        found = printable(", ".join(layout.units))
-        raise InputError(f"no columns of anchors; found {found}; {_EXPECTED}", path)
-    rows = read_rows(path, layout, taken, unit)
-    by_order = () if layout.has_names or columns else (f"{path.name}: {_BY_ORDER}",)
-    return _anchors(rows), (*rows.notes, *by_order)
-
-
-def is_canonical_anchor_file(head: str) -> bool:
-    """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
-    return is_plain_table(head, _REQUIRED, _ALIASES)
+    table = ANCHORS.read(Path(path), columns or NO_NAMES, unit)
+    return _anchors(table), table.told
 
 
 def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
@@ -106,7 +79,7 @@ def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
         place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]
         bias = 2 * [None] if anchor.range_bias_stddev_m is None else [anchor.range_bias_m, anchor.range_bias_stddev_m]
         rows.append([anchor.anchor_id, *("" if number is None else f"{number:.4f}" for number in (*place, *bias))])
-    write_user_table(Path(path), [*_CANONICAL.values()], rows)
+    write_user_table(Path(path), [*ANCHORS.names.values()], rows)
 
 
 def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
@@ -152,6 +125,23 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     unknown = {quantity: "NAME" for quantity in ("anchor_id", *AXES) if quantity not in columns | degrees}
     choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
     raise UnclearListError(WHAT, path, layout, doubts, choices)
+
+
+def find_or_ask(path: Path, layout: Layout) -> dict[str, str] | None:
+    """Do the same, and ask about a short table that is like a list of points as well."""
+    columns = find_anchor_columns(path, layout)
+    if columns is None and (unclear := like_anchors(path)) is not None:
+        raise unclear
+    return columns
+
+
+ANCHORS = TableForm(
+    WHAT,
+    {quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES},
+    ("anchor_id", *AXES),
+    find_or_ask,
+    aliases={"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"},
+)
 
 
 def like_anchors(path: Path) -> UnclearListError | None:
@@ -283,25 +273,24 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
         yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices
 
 
-def _anchors(rows: ListRows) -> tuple[Anchor, ...]:
-    table = rows.table
+def _anchors(table: TextTable) -> tuple[Anchor, ...]:
     if not len(table):
         raise InputError("names no anchor, expected one per line", table.path)
-    anchor_ids = rows.text("anchor_id")
+    anchor_ids = table.text("anchor_id")
     if again := repeated(anchor_ids):
         row, first = again
         message = f"anchor {anchor_ids[row]} is in line {table.line[first]} already, expected each once"
         raise InputError(message, table.path, int(table.line[row]))
-    positions = np.column_stack([rows.metres(axis, COORDINATE_M, np.nan) for axis in AXES])
+    positions = np.column_stack([metres(table, axis, COORDINATE_M, np.nan) for axis in AXES])
     unknown = np.isnan(positions)
     incomplete = unknown.any(axis=1) & ~unknown.all(axis=1)
     if np.any(incomplete):
         row = int(np.argmax(incomplete))
         axis = AXES[int(np.argmax(unknown[row]))]
-        raise table.error(row, rows.columns[axis], "all three coordinates or none")
-    position_stddevs = rows.metres("position_stddev", STDDEV_OR_EXACT_M, 0.0)
-    biases = rows.metres("range_bias", BIAS_M, 0.0)
-    bias_stddevs = rows.metres("range_bias_stddev", STDDEV_OR_EXACT_M, np.nan)
+        raise table.error(row, axis, "all three coordinates or none")
+    position_stddevs = metres(table, "position_stddev", STDDEV_OR_EXACT_M, 0.0)
+    biases = metres(table, "range_bias", BIAS_M, 0.0)
+    bias_stddevs = metres(table, "range_bias_stddev", STDDEV_OR_EXACT_M, np.nan)
     return tuple(
         Anchor(
             anchor_id=anchor_id,

@@ -19,7 +19,14 @@ from rangesfm.measurements.ranges.readers import ros, trek
 from rangesfm.measurements.ranges.readers.measured import without_held
 from rangesfm.measurements.ranges.readers.printed import PRINTED
 from rangesfm.measurements.ranges.readers.reader import Reader, ReadOptions, tell_roles
-from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
+from rangesfm.measurements.ranges.readers.table import (
+    CANONICAL_CSV,
+    MAPPED,
+    PRESETS,
+    TABLE,
+    table_reader,
+    write_ranges_csv,
+)
 from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, RangesOptions
 from rangesfm.util.files.bags import is_bag_folder
 from rangesfm.util.files.contents import AnyPath
@@ -29,7 +36,7 @@ from rangesfm.util.geometry.moments import ByPhoto
 
 __all__ = ["files_of_log", "find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
-_READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED, trek.READER)
+_READERS = (ros.READER, CANONICAL_CSV, *PRESETS, MAPPED, TABLE, *PRINTED, trek.READER)
 _NOTHING_SAID = ReadOptions()
 
 

@@ -1,12 +1,12 @@
-"""Range logs from the named columns of a table; shared by the canonical CSV and by mapped tables."""
+"""Range logs from tables with columns by quantity, and the times in any table."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Categories
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.measurements.ranges.readers.counters import continued
-from rangesfm.measurements.ranges.readers.layout import MISSING, Layout
+from rangesfm.measurements.ranges.readers.layout import MISSING
 from rangesfm.measurements.ranges.readers.measured import which_are_measured, which_are_within_reach
 from rangesfm.measurements.ranges.readers.reader import ReadOptions
 from rangesfm.measurements.ranges.readers.times import (
@@ -37,100 +37,77 @@ from rangesfm.measurements.ranges.readers.units import (
 )
 from rangesfm.measurements.ranges.twr import StampOptions, double_sided_range, single_sided_range
 from rangesfm.options import TIME_S
-from rangesfm.util.files.text_tables import TextTable, read_table
+from rangesfm.util.files.text_tables import TextTable
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 QUANTITIES = (
     *("timestamp", "date", "nanoseconds", "image_name", "anchor_id", "range", "tag_id", "antenna", "range_stddev"),
     *("los", "nlos", *STAMPS),
 )
+CANONICAL = "canonical"
+NO_WIDE: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({})
 
 
-@dataclass(frozen=True)
-class RangeColumns:
-    """Columns of a table that hold the quantities of a log.
+def read_columns(
+    table: TextTable,
+    options: ReadOptions,
+    format: str,
+    *,
+    wide: Mapping[str, tuple[str, str]] = NO_WIDE,
+    anchor_id: str = "",
+) -> RangeLog:
+    """Return the log in a table with columns by quantity (QUANTITIES).
 
-    Attributes:
-        required: by quantity (QUANTITIES), the names of columns that the table must have: one of timestamp and
-            image_name, and range, or instead of it the first four of STAMPS, or ``wide``.
-        optional: by quantity, the names of columns that it may have.
-        wide: by name, the columns of ranges that each belong to one anchor and one tag, with the ids of these.
-        anchor_id: anchor of all ranges, if neither a column nor ``wide`` gives it.
-        layout: layout of the file; None: its first row is its header.
-        is_strict: whether ids are taken literally. Otherwise 1.000 is the id 1.
-        notes: lines for the user about how the columns were found.
-    """
-
-    required: Mapping[str, str]
-    optional: Mapping[str, str] = field(default_factory=dict)
-    wide: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    anchor_id: str = ""
-    layout: Layout | None = None
-    is_strict: bool = False
-    notes: tuple[str, ...] = ()
-
-
-def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format: str) -> RangeLog:
-    """Read a log from the named columns of a table.
+    It has timestamp or image_name, and range, or instead of it the first four of STAMPS, or ``wide``.
 
     Args:
-        options: the user's options for units, time stamps and, without a layout, the separator.
-        format: name of the reader, which the log keeps.
+        options: the user's options for units and time stamps.
+        format: name of the reader, which the log keeps. In a CANONICAL one ids are literal; in others, 1.000 is the id
+            1.
+        wide: columns of ranges that each belong to one anchor and one tag, with the ids of these. The column of the
+            anchor's ids, if there is one, has "@" before its name in the place of the id.
+        anchor_id: anchor of all ranges, if neither a column nor ``wide`` gives it.
 
     Raises:
         InputError: a cell is not a time, an id or a range (the error gives the line), no range is left, or a unit is
             ambiguous.
     """
-    named, layout = {**columns.optional, **columns.required}, columns.layout
-    anchors = [column for anchor_id, _ in columns.wide.values() if (column := column_of_anchor(anchor_id))]
-    notes = [*columns.notes]
-    if layout is None:
-        required = dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])
-        table = read_table(path, [*required], [*columns.optional.values()], separator=options.separator)
-    else:
-        table, more = layout.read()
-        notes += more
-        if layout.are_records and "range" in named:  # records without a range are about something else
-            table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
-    name = {key: column for key, column in named.items() if column in table}
-    units = layout.units if layout else {}
-    anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
-    timestamps = np.zeros(0)
-    if "timestamp" in name:
+    path, notes, is_literal = table.path, [*table.notes], format == CANONICAL
+    anchor, tag = _anchors(table, wide, anchor_id, is_literal), _tags(table, wide, is_literal)
+    timestamps, image_name = np.zeros(0), list[str]()
+    if "timestamp" in table:
         ask = partial(options.which_unit, path, "timestamp")
         # One anchor after the other in a file: the times go back to the log's beginning, whatever the clock is.
-        in_turn = columns.wide or np.count_nonzero(np.diff(anchor.index)) >= len(anchor.names)
-        timestamps, _ = read_timestamps(
-            table, name, units, options.timestamp_unit, notes, ask, may_wrap=bool(in_turn or len(anchor.names) < 2)
-        )
-    image_name = [] if "timestamp" in name else table.text(name["image_name"])
-    num_ends = max(1, len(columns.wide))
-    row = np.repeat(np.arange(len(table)), num_ends)
-    ranges = _ranges(table, name, columns, options)
+        in_turn = wide or np.count_nonzero(np.diff(anchor.index)) >= len(anchor.names)
+        may_wrap = bool(in_turn or len(anchor.names) < 2)
+        timestamps, _ = read_timestamps(table, options.timestamp_unit, notes, ask, may_wrap=may_wrap)
+    else:
+        image_name = table.text("image_name")
+    row = np.repeat(np.arange(len(table)), max(1, len(wide)))
+    ranges = _ranges(table, [*wide] or ["range"], options)
     link = anchor.index * len(tag.names) + tag.index
     measured, of_codes = which_are_measured(ranges, link, path)
     notes += of_codes
     unit, others = "m", list[str]()
-    if "range" in name or columns.wide:
-        column = name.get("range") or next(iter(columns.wide))
-        column = f"{column} {units.get(column, '')}".strip()
+    if "range" in table or wide:
+        column = table.heading("range" if "range" in table else next(iter(wide)))
         ask = partial(options.which_unit, path, "range")
-        times = timestamps[row[measured]] if "timestamp" in name else timestamps
+        times = timestamps[row[measured]] if "timestamp" in table else timestamps
         unit = options.range_unit or range_unit(column, ranges[measured], times, link[measured], notes, ask)
-        mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
+        mapped = options if options.columns or not is_literal else options.changed(columns=table.names)
         others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges[measured], unit)]
     per_metre = UNITS_PER_METRE[unit]
     ranges_m = ranges / per_metre
     measured[measured], of_far = which_are_within_reach(ranges_m[measured], path, others)
     notes += of_far
     row, anchor, tag = row[measured], anchor.subset(measured), tag.subset(measured)
-    stddevs, los = np.full(len(table), np.nan), _line_of_sight(table, name)
-    if "range_stddev" in name:
-        stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected="a number or nothing") / per_metre
+    stddevs, los = np.full(len(table), np.nan), _line_of_sight(table)
+    if "range_stddev" in table:
+        stddevs = table.numbers("range_stddev", empty=np.nan, expected="a number or nothing") / per_metre
     return RangeLog.from_arrays(
         anchor,
         ranges_m[measured],
-        timestamp_s=timestamps[row] if "timestamp" in name else timestamps,
+        timestamp_s=timestamps[row] if "timestamp" in table else timestamps,
         image_name=[image_name[k] for k in row.tolist()] if image_name else (),
         range_stddev_m=stddevs[row],
         tag_id=tag,
@@ -143,15 +120,15 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     )
 
 
-def _anchors(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -> Categories:
+def _anchors(table: TextTable, wide: Mapping[str, tuple[str, str]], anchor_id: str, is_literal: bool) -> Categories:
     """Return the anchor of each range, row by row: the same in each row, or from a column."""
-    if not columns.wide:
-        if "anchor_id" not in name:
-            return _repeated([columns.anchor_id], len(table))
-        return _ids(table, name["anchor_id"], columns, None)
+    if not wide:
+        if "anchor_id" not in table:
+            return _repeated([anchor_id], len(table))
+        return _ids(table, "anchor_id", is_literal)
     each = [
-        _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
-        for anchor_id, _ in columns.wide.values()
+        _ids(table, said, is_literal, "") if said.startswith("@") else _repeated([said], len(table))
+        for said, _ in wide.values()
     ]
     names = Categories.from_texts([name for one in each for name in one.names])
     first = np.cumsum([0, *(len(one.names) for one in each)])
@@ -159,26 +136,18 @@ def _anchors(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -
     return Categories(names.names, index.ravel())
 
 
-def _tags(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -> Categories:
+def _tags(table: TextTable, wide: Mapping[str, tuple[str, str]], is_literal: bool) -> Categories:
     """Return the tag of each range, row by row; each antenna of a tag counts as a tag of its own."""
-    if "tag_id" not in name:
-        tag_ids = [tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()]
+    if "tag_id" not in table:
+        tag_ids = [tag_id or DEFAULT_TAG_ID for _, tag_id in wide.values()]
         return _repeated(tag_ids or [DEFAULT_TAG_ID], len(table))
-    tag = _ids(table, name["tag_id"], columns, DEFAULT_TAG_ID)
-    if "antenna" in name:
-        antenna = _ids(table, name["antenna"], columns, "")
+    tag = _ids(table, "tag_id", is_literal, DEFAULT_TAG_ID)
+    if "antenna" in table:
+        antenna = _ids(table, "antenna", is_literal, "")
         if len(antenna.names) > 1:
             pairs = zip(tag.index.tolist(), antenna.index.tolist())
             tag = Categories.from_texts([f"{tag.names[one]}/{antenna.names[other]}" for one, other in pairs])
-    return Categories(tag.names, np.repeat(tag.index, max(1, len(columns.wide))))
-
-
-def column_of_anchor(anchor_id: str) -> str | None:
-    """Return the name of the column that holds the anchor of a column of ranges, or None.
-
-    Such a column of ranges has "@" and that name in the place of its anchor.
-    """
-    return anchor_id[1:] if anchor_id.startswith("@") else None
+    return Categories(tag.names, np.repeat(tag.index, max(1, len(wide))))
 
 
 def _repeated(ids: list[str], num_rows: int) -> Categories:
@@ -187,9 +156,9 @@ def _repeated(ids: list[str], num_rows: int) -> Categories:
     return Categories(each.names if num_rows else (), np.tile(each.index, num_rows))
 
 
-def _ids(table: TextTable, column: str, columns: RangeColumns, empty: str | None) -> Categories:
+def _ids(table: TextTable, column: str, is_literal: bool, empty: str | None = None) -> Categories:
     ids = table.categories(column, empty=empty)
-    if columns.is_strict or not all(
+    if is_literal or not all(
         re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?0{0,3}\d{1,2})?)?", name) for name in ids.names
     ):
         return ids
@@ -198,21 +167,21 @@ def _ids(table: TextTable, column: str, columns: RangeColumns, empty: str | None
     return Categories(merged.names, merged.index[ids.index])
 
 
-def _ranges(table: TextTable, name: Mapping[str, str], columns: RangeColumns, options: ReadOptions) -> Array:
+def _ranges(table: TextTable, columns: Sequence[str], options: ReadOptions) -> Array:
     """Return the ranges (n,) in the unit of the file, row by row; one that is not positive means no measurement."""
-    if "range" not in name and not columns.wide:
-        return _ranges_by_stamps(table, name, StampOptions.from_log_options(options))
+    if columns == ["range"] and "range" not in table:
+        return _ranges_by_stamps(table, StampOptions.from_log_options(options))
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
-    expected, names = f"a positive number{unit}; 0 means no measurement", columns.wide or [name["range"]]
-    return np.column_stack([table.numbers(k, empty=0.0, missing=MISSING, expected=expected) for k in names]).ravel()
+    expected = f"a positive number{unit}; 0 means no measurement"
+    return np.column_stack([table.numbers(k, empty=0.0, missing=MISSING, expected=expected) for k in columns]).ravel()
 
 
-def _ranges_by_stamps(table: TextTable, name: Mapping[str, str], options: StampOptions) -> Array:
+def _ranges_by_stamps(table: TextTable, options: StampOptions) -> Array:
     """Compute ranges (n,) from two-way ranging, double-sided if there is a third message; 0 where a stamp is empty."""
     stamps = {
-        stamp: table.numbers(name[stamp], empty=np.nan, expected="a time stamp or nothing")
+        stamp: table.numbers(stamp, empty=np.nan, expected="a time stamp or nothing")
         for stamp in STAMPS
-        if stamp in name
+        if stamp in table
     }
     if len(stamps) == len(STAMPS) and len(table) > 0:
         ranges = double_sided_range(**stamps, options=options)
@@ -223,8 +192,6 @@ def _ranges_by_stamps(table: TextTable, name: Mapping[str, str], options: StampO
 
 def read_timestamps(
     table: TextTable,
-    name: Mapping[str, str],
-    units: Mapping[str, str],
     said: str | None,
     notes: list[str],
     ask: Ask,
@@ -235,8 +202,7 @@ def read_timestamps(
     """Return the times (n,) of the rows of a table in seconds, and the unit in which they are written.
 
     Args:
-        name: name of the column of timestamp and, if there are any, of date and nanoseconds.
-        units: unit after the numbers of each column, by its name.
+        table: with the quantity timestamp, and if there are any, date and nanoseconds.
         said: unit that the user gave; None: found from names and values.
         notes: gets a line for the user on what was assumed.
         ask: returns the error about an ambiguous unit.
@@ -245,26 +211,24 @@ def read_timestamps(
     Raises:
         InputError: a cell is not a time, or the unit is ambiguous.
     """
-    column = name["timestamp"]
-    if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
-        return _civil_times(table, name, said, notes, ask), "s"
-    times = table.numbers(column, expected=f"a time in {said or 's'}")
+    if said in CIVIL_UNITS or "date" in table or (said is None and not table.begins_with_number("timestamp")):
+        return _civil_times(table, said, notes, ask), "s"
+    times = table.numbers("timestamp", expected=f"a time in {said or 's'}")
     times, counter = continued(times) if may_wrap else (times, None)
     is_in_ticks = counter is not None and counter.counts_dw1000_ticks
     if counter is not None:
         taken = ", taken for the ticks of a DW1000" * (said is None and is_in_ticks)
-        notes.append(f"{column} {counter}{taken}: its times are continued")
-    name_with_unit = f"{column} {units.get(column, '')}".strip()
-    unit = said or ("ticks" if is_in_ticks else time_unit(name_with_unit, times, notes, ask, slowest_s))
+        notes.append(f"{table.names['timestamp']} {counter}{taken}: its times are continued")
+    unit = said or ("ticks" if is_in_ticks else time_unit(table.heading("timestamp"), times, notes, ask, slowest_s))
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
-    table.refuse(~TIME_S.hold(seconds), column, f"a time in {unit}")
-    return (seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds), unit
+    table.refuse(~TIME_S.hold(seconds), "timestamp", f"a time in {unit}")
+    return (seconds + 1e-9 * table.numbers("nanoseconds") if "nanoseconds" in table else seconds), unit
 
 
-def _civil_times(table: TextTable, name: Mapping[str, str], unit: str | None, notes: list[str], ask: Ask) -> Array:
-    texts = table.text(name["timestamp"])
-    if "date" in name:
-        texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
+def _civil_times(table: TextTable, unit: str | None, notes: list[str], ask: Ask) -> Array:
+    texts = table.text("timestamp")
+    if "date" in table:
+        texts = [f"{date} {time}" for date, time in zip(table.text("date"), texts)]
     civil = [match for text in texts if (match := CIVIL_TIME.fullmatch(text))]
     dates = [match[1] for match in civil]
     order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
@@ -276,7 +240,7 @@ def _civil_times(table: TextTable, name: Mapping[str, str], unit: str | None, no
             seconds[row] = clock.seconds(text)
         except ValueError:
             expected = f"a date as {order} and a time" if dates else "a time such as 2026-01-31T12:00:00.000Z"
-            raise table.error(row, name["timestamp"], expected) from None
+            raise table.error(row, "timestamp", expected) from None
     if texts and TIME_OF_DAY.fullmatch(texts[0]):
         notes.append("times of day without a date: counted from the midnight before the first")
     elif len(civil) < len(texts) or any(match[5] is None for match in civil):
@@ -284,12 +248,12 @@ def _civil_times(table: TextTable, name: Mapping[str, str], unit: str | None, no
     return seconds
 
 
-def _line_of_sight(table: TextTable, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
-    column = name.get("los") or name.get("nlos")
-    if column is None:
+def _line_of_sight(table: TextTable) -> npt.NDArray[np.int8]:
+    column = "los" if "los" in table else "nlos"
+    if column not in table:
         return np.full(len(table), -1, np.int8)
     expected = "1 (line of sight), 0 (none) or nothing"
     los = table.numbers(column, empty=-1.0, expected=expected)
     wrong = ~np.isin(los, (0.0, 1.0)) & (np.array(table.text(column, empty="")) != "")
     table.refuse(wrong, column, expected)
-    return np.where(los < 0, -1, los if "los" in name else 1 - los).astype(np.int8)
+    return np.where(los < 0, -1, los if column == "los" else 1 - los).astype(np.int8)

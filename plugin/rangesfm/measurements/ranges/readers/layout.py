@@ -200,23 +200,21 @@ class Layout:
     Attributes:
         columns: the columns with the cells of the first rows.
         has_names: whether the file names its columns.
-        read_cells: reads all rows as they are in the file, with lines for the user about them. The argument is that of
-            ``read``.
+        read_cells: reads all rows as they are in the file. The argument is that of ``read``.
         are_records: whether the rows are records, in which values may be missing.
     """
 
     columns: tuple[ColumnSample, ...]
     has_names: bool
-    read_cells: Callable[[bool], tuple[TextTable, list[str]]]
+    read_cells: Callable[[bool], TextTable]
     are_records: bool = False
 
     @property
-    def units(self) -> dict[str, str]:
-        """Unit after the numbers of each column, by the column's name."""
-        return {column.name: column.unit for column in self.columns}
+    def names(self) -> list[str]:
+        return [column.name for column in self.columns]
 
-    def read(self, *, every_row: bool = False) -> tuple[TextTable, list[str]]:
-        """Read all rows, with lines for the user about them.
+    def read(self, *, every_row: bool = False) -> TextTable:
+        """Read all rows.
 
         Args:
             every_row: whether a line that is not a row of the table is an error. Otherwise a few are left out.
@@ -224,11 +222,16 @@ class Layout:
         Raises:
             InputError: lines are not rows of the table.
         """
-        table, notes = self.read_cells(every_row)
+        table = self.read_cells(every_row)
         cures = {column.name: column.cure for column in self.columns if column.cure != NO_CURE}
         cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
-        notes += ["numbers have decimal commas"] if any(cure.commas for cure in cures.values()) else []
-        return replace(table, cells={**table.cells, **cured}), notes
+        return replace(
+            table,
+            cells={**table.cells, **cured},
+            units={column.name: column.unit for column in self.columns},
+            missing=MISSING,
+            notes=(*table.notes, *["numbers have decimal commas"] * any(cure.commas for cure in cures.values())),
+        )
 
 
 def are_quaternions(columns: Sequence[ColumnSample]) -> bool:
@@ -239,17 +242,11 @@ def are_quaternions(columns: Sequence[ColumnSample]) -> bool:
     return bool(np.all(np.abs(lengths - 1.0) < _QUATERNION_TOLERANCE))
 
 
-def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
-    """Return the layout of a file without a header row that is known to have these columns."""
-    columns = tuple(ColumnSample(name, ()) for name in header)
-    return Layout(columns, True, lambda every_row: _read_rows(path, header, separator, 0, (), every_row))
-
-
 def find_layout(path: Path, separator: str = "") -> Layout | None:
     """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
-        first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
-        return Layout(tuple(column.cured() for column in first_rows), True, lambda _: (table, []), True)
+        first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.cells)
+        return Layout(tuple(column.cured() for column in first_rows), True, lambda _: table, True)
     lines = read_head(path).split("\n")
     # The last line may be cut off, where the beginning ends or the recording did, but not in a short list.
     whole = lines if len(lines) <= _MOST_OF_LIST else lines[:-1]
@@ -288,16 +285,26 @@ def find_layout(path: Path, separator: str = "") -> Layout | None:
     return Layout(
         tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
         names is not None,
-        lambda every_row: _read_rows(path, header, separator, num_skipped, header_row, every_row),
+        lambda every_row: read_rows(path, header, separator, num_skipped, header_row, every_row=every_row),
     )
 
 
-def _read_rows(
-    path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str], every_row: bool
-) -> tuple[TextTable, list[str]]:
+def read_rows(
+    path: Path,
+    header: Sequence[str],
+    separator: str,
+    num_skipped: int = 0,
+    names: Sequence[str] = (),
+    *,
+    every_row: bool = False,
+) -> TextTable:
     """Read all rows without empty ones. A few other lines (text, a truncated line, a repeated header) are left out.
 
-    A note says how many, or the first of them is an error if ``every_row`` is true.
+    Args:
+        header: the columns.
+        num_skipped: lines before the first row.
+        names: cells of the header row, which may be repeated.
+        every_row: whether the first of the other lines is an error; otherwise a note says how many there are.
     """
     numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
     content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
@@ -307,10 +314,12 @@ def _read_rows(
     if odd and (every_row or len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content)):
         line, row = odd[0]
         raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
-    lost = f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}" if odd else ""
+    lost = (
+        [f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}"] if odd else []
+    )
     columns = list(zip(*(row for _, row in rows))) or [()] * len(header)
     cells = {name: [*column] for name, column in zip(header, columns)}
-    return TextTable(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
+    return TextTable(path, np.array([line for line, _ in rows], np.int64), cells, notes=tuple(lost))
 
 
 def _is_comment(line: str) -> bool:
@@ -399,7 +408,7 @@ def _read_records(path: Path) -> TextTable | None:
         return None
     names = tuple(dict.fromkeys(name for _, record in numbered for name in record))
     cells = {name: [record.get(name, "") for _, record in numbered] for name in names}
-    return TextTable(path, names, np.array([line for line, _ in numbered], np.int64), cells) if names else None
+    return TextTable(path, np.array([line for line, _ in numbered], np.int64), cells) if names else None
 
 
 def _share_named(head: str) -> float:

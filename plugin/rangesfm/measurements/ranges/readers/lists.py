@@ -1,4 +1,4 @@
-"""Lists in tables of any layout: anchors with their positions, and photos with their times.
+"""Tables that people write, of any layout: anchors, points, lengths, marks, positions, and photos with their times.
 
 Their columns are recognized as those of logs are. If that is not sure, the user is asked, with the flags to type. Every
 row of a list counts: a line that is not a row of the table is an error.
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
@@ -18,14 +18,26 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
+from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import MISSING, NO_CURE, ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import NO_CURE, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE, named_length_unit
 from rangesfm.option_model import Bounds
-from rangesfm.util.files.text_tables import FOUND, NO_NAMES, TextTable, read_head, read_table
+from rangesfm.util.files.text_tables import (
+    FOUND,
+    NO_NAMES,
+    TextTable,
+    has_columns,
+    header_names,
+    is_plain_table,
+    read_head,
+    read_table,
+)
 
 AXES = ("x", "y", "z")
 _MAX_NUM_WAYS = 6  # ways to read a list that are offered
+# Largest plausible median time between two photos or positions, in seconds.
+_SLOWEST_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -101,38 +113,6 @@ def ways_to_complete(
         yield f"if {' and '.join(f'{name} is {quantity}' for quantity, name in more.items())}", {**columns, **more}
 
 
-def layout_of_list(path: Path, what: str, expected: str) -> Layout:
-    """Return the layout of the table in a file; ``what`` and ``expected`` are words for the InputError without one."""
-    layout = find_layout(path)
-    if layout is None:
-        found = f"no table of {what}" if read_head(path).strip() else "the file is empty"
-        raise InputError(f"{found}, {expected}", path)
-    return layout
-
-
-def columns_by_user(
-    given: Mapping[str, str], quantities: Sequence[str], required: Sequence[str], layout: Layout, path: Path
-) -> dict[str, str]:
-    """Return the columns that the user named, in the order of the quantities.
-
-    Args:
-        required: quantities that must be among them, such as "x", or "timestamp or image_name" of which one must be.
-
-    Raises:
-        InputError: a quantity is unknown or missing, or the table has no such column.
-    """
-    for quantity, name in given.items():
-        if quantity not in quantities:
-            message = f"quantity in columns is '{printable(quantity)}', expected one of {', '.join(quantities)}"
-            raise InputError(message, path)
-        if name not in layout.units:
-            raise InputError(f"no column {printable(name)}; found {printable(', '.join(layout.units))}", path)
-    if missing := [those for those in required if given.keys().isdisjoint(those.split(" or "))]:
-        expected = f"{', '.join(required[:-1])} and {required[-1]}"
-        raise InputError(f"columns do not name {', '.join(missing)}, expected {expected}", path)
-    return {quantity: given[quantity] for quantity in quantities if quantity in given}
-
-
 def coordinates_of_point(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
     """Return, of the columns that may be one coordinate, those of the measured point itself, as it is in the map.
 
@@ -146,92 +126,170 @@ def coordinates_of_point(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
 
 
 @dataclass(frozen=True)
-class ListRows:
-    """The rows of a list.
+class TableForm:
+    """A kind of table that people write: its canonical CSV, and how the columns of other tables are found.
 
     Attributes:
-        table: the rows. columns: name of the column of each quantity that the list has. units: their units of length.
-        missing: texts of a cell, in small letters, that counts as empty.
-        notes: lines for the user about how the file was read; empty for a canonical CSV.
+        what: what it lists, for messages.
+        names: name of the column of each quantity in the canonical CSV. Those of lengths end in ``_m``.
+        required: quantities that it must have, such as "x", or "timestamp or image_name" of which one is enough.
+        find: returns the name of the column of each quantity in another table, or None if it is no such table.
+        also: quantities that only other tables have.
+        aliases: other names of columns in the canonical CSV, as for ``read_table``.
     """
 
-    table: TextTable
-    columns: Mapping[str, str]
-    units: Mapping[str, str]
-    missing: Sequence[str]
-    notes: tuple[str, ...] = ()
+    what: str
+    names: Mapping[str, str]
+    required: Sequence[str]
+    find: Callable[[Path, Layout], Mapping[str, str] | None]
+    also: Sequence[str] = ()
+    aliases: Mapping[str, str] = field(default_factory=dict)
 
-    def text(self, quantity: str, empty: str | None = None) -> list[str]:
-        """Return the cells of a quantity; ``empty`` replaces those that are empty or missing, and None refuses them."""
-        if quantity not in self.columns and empty is not None:
-            return [empty] * len(self.table)
-        return self.table.text(self.columns[quantity], empty=empty)
+    @property
+    def _ways(self) -> list[list[str]]:
+        """The columns of a canonical CSV, in each way to choose them."""
+        each = (quantity.split(" or ") for quantity in self.required)
+        return [[self.names[quantity] for quantity in way] for way in product(*each)]
 
-    def metres(self, quantity: str, bounds: Bounds, empty: float | None = None) -> Array:
-        """Return lengths (n,) in metres; else as for ``text``."""
-        if quantity not in self.columns and empty is not None:
-            return np.full(len(self.table), empty)
-        name, unit = self.columns[quantity], self.units[quantity]
-        expected = str(bounds) + ", or nothing" * (empty is not None) + f" (here in {unit})" * (unit != "m")
-        filled = None if empty is None else np.nan
-        values = self.table.numbers(name, empty=filled, missing=self.missing, expected=expected)
-        values = values / UNITS_PER_METRE[unit]
-        self.table.refuse(~(np.isnan(values) | bounds.hold(values)), name, expected)
-        return np.where(np.isnan(values), np.nan if empty is None else empty, values)
+    @property
+    def expected(self) -> str:
+        """What a file is expected to hold, for messages."""
+        each = (" or ".join(self.names[one] for one in quantity.split(" or ")) for quantity in self.required)
+        return f"expected a table with {','.join(each)}"
+
+    def has_usual_names(self, head: str) -> bool:
+        """Return whether a file with this beginning has the columns of the canonical CSV, whatever its numbers are."""
+        return any(has_columns(head, way, self.aliases) for way in self._ways)
+
+    def is_canonical(self, head: str) -> bool:
+        """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
+        return any(is_plain_table(head, way, self.aliases) for way in self._ways)
+
+    def is_such(self, path: Path) -> bool:
+        """Return whether a file is such a table by the names of its columns."""
+        layout = find_layout(path)
+        if layout is None:
+            return self.is_canonical(read_head(path))
+        try:
+            return layout.has_names and self.find(path, layout) is not None
+        except InputError:
+            return False
+
+    def read_canonical(self, path: Path, separator: str = FOUND) -> TextTable:
+        """Read a canonical CSV, whose lengths are in metres; errors as of ``read_table``."""
+        found = {self.aliases.get(name, name) for name in header_names(read_head(path), separator)}
+        way = next((way for way in self._ways if {*way} <= found), self._ways[0])
+        optional = [name for name in self.names.values() if name not in way]
+        return read_table(path, way, optional, aliases=self.aliases, separator=separator).by_quantity(self.names)
+
+    def read(
+        self, path: Path, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None, *, every_row: bool = True
+    ) -> TextTable:
+        """Read a file of any layout, with columns by quantity.
+
+        Args:
+            columns: name of the column of each quantity, or its number in a table without names; empty: recognized.
+            unit: unit of the required lengths; None: that in the names of their columns or in their cells, else metres.
+                A length without a unit of its own has that of the first of these.
+            every_row: whether a line that is not a row of the table is an error. Otherwise a few are left out.
+
+        Raises:
+            UnclearListError: the columns are not known for sure; the advice says what to type.
+            InputError: the file is no such table, or a line is not a row of it.
+        """
+        if not columns and unit is None and self.is_canonical(read_head(path)):
+            return self.read_canonical(path)
+        layout = find_layout(path)
+        if layout is None:
+            found = f"no table of {self.what}" if read_head(path).strip() else "the file is empty"
+            raise InputError(f"{found}, {self.expected}", path)
+        taken = self._columns_by_user(columns, layout, path) if columns else self.find(path, layout)
+        if taken is None:
+            found = printable(", ".join(layout.names))
+            raise InputError(f"no columns of {self.what}; found {found}; {self.expected}", path)
+        table = layout.read(every_row=every_row)
+        # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
+        uncured = [column for column in layout.columns if column.name in taken.values() and column.cure == NO_CURE]
+        cures = {column.name: column.cured().cure for column in uncured}
+        cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items() if cure != NO_CURE}
+        unused = printable(", ".join(name for name in layout.names if name not in taken.values()))
+        notes = (
+            columns_taken(taken, layout.has_names or bool(columns)) + f"; not used: {unused}" * bool(unused),
+            *table.notes,
+        )
+        table = replace(table, cells={**table.cells, **cells}, notes=notes).by_quantity(taken)
+        return self._with_lengths(table, unit)
+
+    def _columns_by_user(self, given: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
+        """Return the columns that the user named, in the order of the quantities.
+
+        Raises:
+            InputError: a quantity is unknown or missing, or the table has no such column.
+        """
+        quantities = (*self.names, *self.also)
+        for quantity, name in given.items():
+            if quantity not in quantities:
+                message = f"quantity in columns is '{printable(quantity)}', expected one of {', '.join(quantities)}"
+                raise InputError(message, path)
+            if name not in layout.names:
+                raise InputError(f"no column {printable(name)}; found {printable(', '.join(layout.names))}", path)
+        if missing := [those for those in self.required if given.keys().isdisjoint(those.split(" or "))]:
+            expected = f"{', '.join(self.required[:-1])} and {self.required[-1]}"
+            raise InputError(f"columns do not name {', '.join(missing)}, expected {expected}", path)
+        return {quantity: given[quantity] for quantity in quantities if quantity in given}
+
+    def _with_lengths(self, table: TextTable, unit: str | None) -> TextTable:
+        """Return the table with the unit of each length."""
+        lengths = [quantity for quantity, name in self.names.items() if name.endswith("_m") and quantity in table]
+        named = {quantity: named_length_unit(table.heading(quantity)) for quantity in lengths}
+        first = [quantity for quantity in self.required if quantity in lengths]
+        units = {quantity: unit or named[quantity] or "m" for quantity in first}
+        others = sorted({*units.values()} - {"m"})
+        what = "distances" if "distance" in units else "coordinates"
+        note = [f"{what} are in {' and '.join(others)}"] if others else []
+        units = {quantity: units.get(quantity) or own or units[first[0]] for quantity, own in named.items()}
+        return replace(table, units={**table.units, **units}, notes=(*table.notes, *note))
 
 
-def read_canonical_rows(
-    path: Path, names: Mapping[str, str], required: Sequence[str], aliases: Mapping[str, str] = NO_NAMES
-) -> ListRows:
-    """Read a canonical CSV, whose lengths are in metres.
+def columns_taken(columns: Mapping[str, str], are_named: bool) -> str:
+    """Return a line for the user that says which columns hold the quantities."""
+    by_values = "" if are_named else " (by their numbers and values: the table has no names)"
+    return f"columns taken: {', '.join(f'{quantity} = {name}' for quantity, name in columns.items())}{by_values}"
 
-    Args:
-        names: name of the column of each quantity. required: names of those that it must have.
-        aliases: as for ``read_table``.
+
+def metres(table: TextTable, quantity: str, bounds: Bounds, empty: float | None = None) -> Array:
+    """Return lengths (n,) in metres; ``empty`` as for ``TextTable.numbers``.
 
     Raises:
-        InputError: as ``read_table``.
+        InputError: one is out of the bounds.
     """
-    optional = [name for name in names.values() if name not in required]
-    table = read_table(path, required, optional, aliases=aliases, separator=FOUND)
-    columns = {quantity: name for quantity, name in names.items() if name in table}
-    return ListRows(table, columns, dict.fromkeys(columns, "m"), ("",))
+    unit = table.units.get(quantity) or "m"
+    expected = str(bounds) + ", or nothing" * (empty is not None) + f" (here in {unit})" * (unit != "m")
+    values = table.numbers(quantity, empty=None if empty is None else np.nan, expected=expected)
+    values = values / UNITS_PER_METRE[unit]
+    is_empty = np.isnan(values)
+    if quantity in table:
+        table.refuse(~(is_empty | bounds.hold(values)), quantity, expected)
+    return values if empty is None else np.where(is_empty, empty, values)
 
 
-def length_units(
-    layout: Layout, columns: Mapping[str, str], unit: str | None = None, of: Sequence[str] = AXES
-) -> tuple[dict[str, str], list[str]]:
-    """Return the unit of each quantity, with a line for the user if it is not metres.
+def times_by_row(table: TextTable, what: str, said: str | None, flag: str) -> tuple[Array, str, list[str]]:
+    """Return the times (n,) of photos or of positions in seconds, their unit, and lines for the user.
 
     Args:
-        columns: name of the column of each quantity.
-        unit: of the quantities ``of``; None: that in the names of their columns or their cells, else metres. A quantity
-            without a unit of its own has that of the first of these.
-    """
-    named = {quantity: named_length_unit(f"{name} {layout.units[name]}") for quantity, name in columns.items()}
-    units = {quantity: unit or named[quantity] or "m" for quantity in of}
-    others = sorted({*units.values()} - {"m"})
-    notes = [f"{'distances' if of[0] == 'distance' else 'coordinates'} are in {' and '.join(others)}"] if others else []
-    usual = units[of[0]] if of else "m"
-    return {quantity: units.get(quantity) or own or usual for quantity, own in named.items()}, notes
-
-
-def read_rows(
-    path: Path, layout: Layout, columns: Mapping[str, str], unit: str | None = None, of: Sequence[str] = AXES
-) -> ListRows:
-    """Read the rows of a list of any layout; arguments as for ``length_units``.
+        what: what the table lists. said: unit that the user gave. flag: by which one gives it.
 
     Raises:
-        InputError: a line is not a row of the table.
+        UnclearListError: the unit is not known for sure.
+        InputError: a cell is not a time.
     """
-    table, notes = layout.read(every_row=True)
-    # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
-    uncured = [column for column in layout.columns if column.name in columns.values() and column.cure == NO_CURE]
-    cured = {column.name: column.cured().cure for column in uncured}
-    cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cured.items() if cure != NO_CURE}
-    taken = ", ".join(f"{quantity} = {name}" for quantity, name in columns.items())
-    unused = [name for name in layout.units if name not in columns.values()]
-    notes.insert(0, f"columns taken: {taken}" + (f"; not used: {printable(', '.join(unused))}" if unused else ""))
-    units, more = length_units(layout, columns, unit, of)
-    told = tuple(f"{path.name}: {note}" for note in (*notes, *more))
-    return ListRows(replace(table, cells={**table.cells, **cells}), columns, units, MISSING, told)
+    notes = list[str]()
+
+    def ask(units: Sequence[str], why: str) -> InputError:
+        choices = [Choice(f"if they are {one}", (flag, one)) for one in units]
+        layout = find_layout(table.path)
+        assert layout is not None
+        return UnclearListError(what, table.path, layout, [f"the times have {why}"], choices)
+
+    times_s, unit = read_timestamps(table, said, notes, ask, slowest_s=_SLOWEST_S)
+    return times_s, unit, notes

@@ -17,20 +17,29 @@ import numpy as np
 
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.measurements.ranges.readers.columns import QUANTITIES, STAMPS, RangeColumns, read_columns
+from rangesfm.measurements.ranges.readers.columns import CANONICAL, QUANTITIES, STAMPS, read_columns
 from rangesfm.measurements.ranges.readers.guess import Guess, described, guess_columns
-from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions, find_layout, layout_without_header
+from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions, find_layout, read_rows
+from rangesfm.measurements.ranges.readers.lists import TableForm, columns_taken
 from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.text_tables import header_names, read_head, write_user_table
+from rangesfm.util.files.text_tables import TextTable, header_names, read_head, read_table, write_user_table
 from rangesfm.util.geometry.moments import ByTime
 
-_BY_TIME = RangeColumns(
-    required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
-    optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
-    is_strict=True,
+_FORM = TableForm(
+    "ranges",
+    {
+        "timestamp": "timestamp_s",
+        "image_name": "image_name",
+        "anchor_id": "anchor_id",
+        "range": "range_m",
+        "tag_id": "tag_id",
+        "range_stddev": "range_stddev_m",
+        "los": "los",
+    },
+    ("timestamp or image_name", "anchor_id", "range"),
+    lambda path, layout: None,
 )
-_BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
 _PRESETS = {
     "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
     "miluv": {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
@@ -84,11 +93,31 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
     guess = guess_columns(layout)
     if guess.missing or guess.doubts or (not layout.has_names and _is_trajectory(layout)):
         raise _question(path, options, layout, guess)
-    notes = tuple(_notes(path, layout, guess))
-    columns = RangeColumns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
-    return replace(
-        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), roles=guess.roles
-    )
+
+    def read(path: Path, options: ReadOptions) -> RangeLog:
+        table = _rows(layout, {**guess.columns, **_columns_of_wide(guess.wide)})
+        table = replace(table, notes=(*_notes(path, layout, guess), *table.notes))
+        return _log(table, options, TABLE.name, guess.wide)
+
+    return replace(TABLE, read=read, roles=guess.roles)
+
+
+def _rows(layout: Layout, columns: Mapping[str, str]) -> TextTable:
+    table = layout.read().by_quantity(columns)
+    if layout.are_records and "range" in table:  # records without a range are about something else
+        table = table.where([cell != "" for cell in table.text("range", empty="")])
+    return table
+
+
+def _columns_of_wide(wide: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Return the names of the columns of ranges of one anchor, and of those with the ids of these anchors."""
+    anchors = {anchor_id: anchor_id[1:] for anchor_id, _ in wide.values() if anchor_id.startswith("@")}
+    return {**{f"range:{name}": name for name in wide}, **anchors}
+
+
+def _log(table: TextTable, options: ReadOptions, format: str, wide: Mapping[str, tuple[str, str]]) -> RangeLog:
+    by_quantity = {f"range:{name}": ids for name, ids in wide.items()}
+    return read_columns(table, options, format, wide=by_quantity, anchor_id=_anchor_of_file(table.path))
 
 
 def _is_trajectory(layout: Layout) -> bool:
@@ -98,9 +127,7 @@ def _is_trajectory(layout: Layout) -> bool:
 
 
 def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
-    said = ", ".join(f"{quantity} = {name}" for quantity, name in guess.columns.items())
-    by_values = "" if layout.has_names else " (by their numbers and values: the table has no names)"
-    yield f"columns taken: {said}{by_values}"
+    yield columns_taken(guess.columns, layout.has_names)
     yield from guess.notes
     if "anchor_id" not in guess.columns and not guess.wide:
         yield f"no column gives the anchor: it is named '{_anchor_of_file(path)}' after the file"
@@ -169,22 +196,27 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
     wide = _wide(told, path)
     columns = {key: name for key, name in told.items() if not key.startswith("range:")}
     layout = find_layout(path, options.separator) if format == MAPPED.name else None
-    if format == "inrol":
-        layout = layout_without_header(path, _INROLS_COLUMNS, " ")
-    elif layout is not None and not {*columns.values(), *wide} <= layout.units.keys():
+    if layout is not None and not {*columns.values(), *wide} <= {*layout.names}:
         layout = None
     third_message = {}
     if "range" not in columns and not wide:
-        names = [*layout.units] if layout else header_names(read_head(path), options.separator)
+        names = layout.names if layout else header_names(read_head(path), options.separator)
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
             raise InputError(f"columns name neither range nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    return read_columns(
-        path, RangeColumns(columns, third_message, wide, _anchor_of_file(path), layout), options, format
-    )
+    columns |= _columns_of_wide(wide)
+    required, optional = dict.fromkeys(columns.values()), [*third_message.values()]
+    columns |= third_message
+    if layout is not None:
+        table = _rows(layout, columns)
+    elif format == "inrol":
+        table = read_rows(path, _INROLS_COLUMNS, " ").by_quantity(columns)
+    else:
+        table = read_table(path, [*required], optional, separator=options.separator).by_quantity(columns)
+    return _log(table, options, format, wide)
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
@@ -237,20 +269,13 @@ def write_ranges_csv(log: RangeLog, path: AnyPath) -> None:
     write_user_table(Path(path), [*columns], zip(*columns.values()))
 
 
-def _recognizes_canonical(head: str) -> bool:
-    names = {*header_names(head)}
-    return {"anchor_id", "range_m"} <= names and not names.isdisjoint({"timestamp_s", "image_name"})
-
-
 def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
     if options.columns or options.timestamp_unit not in (None, "s"):
         raise InputError("the canonical CSV has fixed columns, with times in seconds; use format 'mapped'", path)
-    names = header_names(read_head(path), options.separator)
-    columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
-    return read_columns(path, columns, options.changed(timestamp_unit=None), CANONICAL.name)
+    return read_columns(_FORM.read_canonical(path, options.separator), options.changed(timestamp_unit=None), CANONICAL)
 
 
-CANONICAL = Reader("canonical", _recognizes_canonical, _read_canonical)
+CANONICAL_CSV = Reader(CANONICAL, _FORM.is_canonical, _read_canonical)
 PRESETS = tuple(
     Reader(
         name,
