@@ -193,9 +193,9 @@ def test_beside_ranges_a_check_point_is_compared_with_the_map_that_they_hold(
         }
     )
     summary = scale_model(survey, progress=QUIET).summary
-    assert [(test.name, test.subject) for test in summary.tests if test.rejected] == [("check point in the map", "M2")]
+    assert [(test.name, test.subject) for test in summary.tests if test.rejected] == [("check point", "M2")]
     assert known(summary.place).verdict == "doubtful"
-    assert "the map has the check point M2 1." in known(summary.place).reasons[0]
+    assert "the check point M2 is 1." in known(summary.place).reasons[0]
     assert not any("not used" in reason for reason in summary.scale.reasons)
 
 

@@ -245,7 +245,7 @@ def range_equations_of(metric: MetricResult) -> Values:
 def position_equations_of(metric: MetricResult) -> Values:
     """Return residuals of positions and control points, their derivatives by the map as a whole, and their errors."""
     found, problem = find_kind(metric.kinds, PositionScale), metric.all_measured.problem
-    if found is None:
+    if found is None or not found.is_used:
         return {}
     return {
         "positions residual": problem.linear.residual_m[problem.rows[POSITIONS]],
@@ -290,7 +290,7 @@ def covariances_of(metric: MetricResult) -> Values:
     found["scale half width"] = np.array(uncertainty.half_width_95)
     if metric.estimate.placement is not None:
         found["covariance placement"] = metric.estimate.placement
-    if find_kind(metric.kinds, PositionScale) is not None:
+    if POSITIONS in metric.all_measured.observed:
         found["covariance by positions"] = metric.all_measured.posterior.place
     joint = metric.map_errors
     if joint.are_known:

@@ -249,7 +249,7 @@ class JointMap:
         path: of the map. placed: from its world to the metric world, about which all is linear.
         bending: of the map. is_at_rest: whether photos and measurements made it together; otherwise it is moved as one
             piece.
-        observed: the observations of the kinds that are used, by kind.
+        observed: the observations of the kinds that are used or compared with the map, by kind.
         problem: of all these, with learnt errors. posterior: what they say of the map.
         metres_per_unit: of the unscaled model, in the world of the path.
     """
@@ -344,12 +344,14 @@ def observations(
 ) -> list[Observations]:
     """Return the observations of the kinds that are used, about a placement, of which none crowds out another.
 
+    Beside others that place the map in the site, positions there are among them even if all are only compared with it.
+
     Args:
         max_num: about the largest number of all together.
     """
-    used = [each for each in kinds if each.is_used]
-    in_site, found, num = any(each.places_map for each in used), list[Observations](), 0
-    for k, each in reversed(list(enumerate(used))):
+    in_site, found, num = any(each.places_map for each in kinds if each.is_used), list[Observations](), 0
+    seen = [each for each in kinds if each.is_used or (in_site and each.places_map)]
+    for k, each in reversed(list(enumerate(seen))):
         most = max(max_num - num, max_num // 2) if k == 0 else max_num // 2
         found.append(each.observed(placed, in_site=in_site, max_num=most))
         num += len(found[-1].residual_m)
@@ -366,7 +368,8 @@ def tested_kinds(
     """
     found = observations(kinds, placed, max_num)
     return tuple(
-        each.tested(placed, [other for other in found if other.kind != each.kind], is_last=is_last) for each in kinds
+        each.tested(placed, [of for of in found if of.kind != each.kind and of.is_used.any()], is_last=is_last)
+        for each in kinds
     )
 
 

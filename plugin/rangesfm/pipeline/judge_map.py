@@ -8,11 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.diagnostics.finished_map import doubts_of_points, doubts_of_refinement, place_of_map
 from rangesfm.diagnostics.lens import fit_lens
-from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.scale.scale_estimate import refuse_unknown
@@ -38,7 +36,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     on_map, path = metric.all_measured, metric.trajectory.as_in(metric.final)
     bends_m = [each.bends_m(on_map) for each in on_map.kinds]
     bent_by_m = next((each for each in bends_m if len(each)), np.zeros(0))
-    diagnosis = _tested(run, metric, path.centers, bent_by_m)
+    diagnosis = _tested(run, metric)
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
     doubts: list[Doubt] = []
     if metric.refined is not None and metric.refined.why_broken:
@@ -64,35 +62,21 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     """Return a doubt if the photos fit far better with another camera model, and lengths change with it."""
     if not metric.final.num_points3D():
         return ()
-    is_learnt = any(each.shows_bending for each in metric.kinds)
+    is_learnt = any(each.shows_bending and each.is_used for each in metric.kinds)
     factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else LARGEST_FACTOR
     half_width_95 = metric.estimate.uncertainty.half_width_95
     fit = fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE))
     return () if fit is None else fit.doubts(factor, half_width_95)
 
 
-def _tested(run: SurveyRun, metric: MetricResult, centers_m: Array, bent_by_m: Array) -> Diagnosis:
-    """Return the tests of all kinds, first of those that place the map.
-
-    Points are tested once more against a map that others hold, too.
-
-    Args:
-        centers_m: (n, 3) keyframe centres in the final map. bent_by_m: (n,) as for ``place_of_map``.
-    """
-    estimate, on_map, diagnosis = metric.estimate, metric.all_measured, Diagnosis()
-    for is_placing in (True, False):
-        kinds = [each for each in on_map.kinds if each.places_map is is_placing]
-        for each in kinds:
-            try:
-                diagnosis = diagnosis.with_more(each.tests(on_map, estimate.by_kind))
-            except np.linalg.LinAlgError as error:
-                run.journal.warn(f"mistakes were not tested, because the {each.words} determine too little: {error}")
-        if is_placing and estimate.placement is not None and any(each.is_solved for each in kinds):
-            by_antenna = metric.inputs.positions.antenna is not None and len(kinds) > 1
-            placed = Placed(estimate.placement, centers_m[0], float(bent_by_m.max(initial=0.0)), by_antenna=by_antenna)
-            stddev = estimate.uncertainty.empirical
-            of_points = diagnose_points(metric.inputs.positions.points, metric.final, metric.map_errors, stddev, placed)
-            diagnosis = diagnosis.with_more(of_points)
+def _tested(run: SurveyRun, metric: MetricResult) -> Diagnosis:
+    """Return the tests of all kinds, first of those that place the map."""
+    on_map, diagnosis = metric.all_measured, Diagnosis()
+    for each in sorted(on_map.kinds, key=lambda each: not each.places_map):
+        try:
+            diagnosis = diagnosis.with_more(each.tests(on_map, metric.estimate.by_kind))
+        except np.linalg.LinAlgError as error:
+            run.journal.warn(f"mistakes were not tested, because the {each.words} determine too little: {error}")
     return diagnosis
 
 

@@ -8,7 +8,8 @@ chi-square distributed with as many degrees of freedom as H has columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -72,6 +73,14 @@ class LinearMap:
     prior_residual: Array
     prior_design: Array
     columns: Columns
+
+    def with_more(self, unknowns: Sequence[Array]) -> LinearMap:
+        """Return the equations with further unknowns, by effects (c, m) on observations, or (c + r, m) on all."""
+        num = len(self.residual_m)
+        num_rows = num + len(self.prior_residual)
+        effects = (np.pad(each, ((0, num_rows - len(each)), (0, 0))) for each in unknowns)
+        columns = np.hstack([np.vstack([self.design, self.prior_design]), *effects])
+        return replace(self, design=columns[:num], prior_design=columns[num:])
 
     def solved(self, covariance_m2: Array) -> Solved:
         """Return the solution for residuals with this (c, c) covariance."""

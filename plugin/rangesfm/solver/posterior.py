@@ -229,14 +229,12 @@ class JointProblem:
                 errs in measurements, and in the map.
             near: sizes in nearly the same problem to start from, by name, which takes half the time.
         """
-        used, linear, num = self.is_used, self.linear, len(self.is_used)
-        num_rows = num + len(linear.prior_residual)
-        effects = [np.pad(each, ((0, num_rows - len(each)), (0, 0))) for each in mistakes]
-        columns = np.hstack([np.vstack([linear.design, linear.prior_design]), *effects])
+        used, linear, widened = self.is_used, self.linear, self.linear.with_more(mistakes)
         # Residuals are taken where those of the priors are smallest.
         back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=UNDETERMINED)[0]
         # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
-        most_bent = most_bent if len(self.rows) == 1 else min(most_bent, SIGNIFICANT_STDDEVS)
+        num_kinds = sum(used[rows].any() for rows in self.rows.values())
+        most_bent = min(most_bent, SIGNIFICANT_STDDEVS) if num_kinds > 1 else most_bent
         components = self.components
         if not used.all():
             at = np.ix_(used, used)
@@ -247,8 +245,8 @@ class JointProblem:
         sizes = learnt_sizes(
             components,
             (linear.design @ back - linear.residual_m)[used],
-            columns[:num][used],
-            columns[num:],
+            widened.design[used],
+            widened.prior_design,
             {name: most_bent if name in BENDS else most_unusual for name in self.sizes},
             near,
         )

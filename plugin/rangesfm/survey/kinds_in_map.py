@@ -27,7 +27,7 @@ from rangesfm.measurements.lengths.locate_lengths import (
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_fit import POSITIONS
-from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, only_compared, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -85,11 +85,19 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     surveyed = _with_antenna_at(inputs.positions, {} if at.rest is None else at.rest.state.blocks)
-    known = surveyed.located(at.model, at.path)
-    if known.is_check.all():
+    known, before = surveyed.located(at.model, at.path), find_kind(at.before, PositionScale)
+    if not len(known):
         return None
+    given, notes = (known, at.path, at.bending, surveyed), tuple[str, ...]()
     is_at_rest, unit = bool(at.before), at.metres_per_unit
-    return scale_by_positions(known, at.path, at.bending, surveyed, is_at_rest=is_at_rest, metres_per_unit=unit)
+    if not known.is_check.all() and (before is None or before.is_used):
+        try:
+            return scale_by_positions(*given, is_at_rest=is_at_rest, metres_per_unit=unit)
+        except GeometryError as error:
+            if is_at_rest:
+                raise
+            notes = (_not_used(POSITIONS, error),)
+    return only_compared(*given, is_at_rest=is_at_rest, metres_per_unit=unit, notes=notes)
 
 
 def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array]) -> SurveyedPositions:
@@ -132,6 +140,10 @@ _WORDS = {
 }
 
 
+def _not_used(kind: str, error: GeometryError) -> str:
+    return f"the {_WORDS[kind]} are not used: {error}"
+
+
 def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located, ...], tuple[str, ...]]:
     """Return the kinds in a map, and why others are not used, in words.
 
@@ -147,7 +159,7 @@ def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located,
         except GeometryError as error:
             if at.before:
                 raise
-            remarks.append(f"the {_WORDS[kind]} are not used: {error}")
+            remarks.append(_not_used(kind, error))
             continue
         found += [] if located is None else [located]
     return tuple(found), tuple(remarks)

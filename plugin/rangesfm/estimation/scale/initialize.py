@@ -127,13 +127,14 @@ def _started(
     What is left out is first found without the kinds that are solved beside the others, and then once more with them.
     """
     others = tuple(each for each in located if isinstance(each, KindOnMap))
-    if others:
-        others = tested_kinds(others, place_first(others).start, MAX_NUM_OBSERVATIONS, is_last=False)
+    if used := [each for each in others if each.is_used]:
+        others = tested_kinds(others, place_first(used).start, MAX_NUM_OBSERVATIONS, is_last=False)
     for is_last in (False, True):
         kinds = beside_others(located, others)
         used = [each for each in kinds if each.is_used]
         if not used:
-            raise GeometryError("the scale is not determined: nothing that was measured is in the map")
+            why = [note for each in kinds for note in each.notes] or ["nothing that was measured is in the map"]
+            raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
         # One kind that gives both the map's scale and its place is no scale beside others.
         is_all = len(used) == 1 and (used[0].places_map or used[0].is_solved)
         by_kind = {} if is_all else {each.kind: each.alone.scale for each in used}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +15,7 @@ from rangesfm.arrays import Array, Mask, median, rms
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds, most_contradicting
 from rangesfm.measurements.kind import Doubt, Measurements
-from rangesfm.measurements.lengths.tape import LEFT_OUT, Marker
+from rangesfm.measurements.lengths.tape import CHECK, LEFT_OUT, Marker
 from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
@@ -36,7 +37,7 @@ from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.options import LEVER_ARM_M
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns, EstimatedMistake, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
@@ -51,7 +52,9 @@ from rangesfm.util.processes.threads import with_one_blas_thread
 _MAX_TURN_STDDEV = 0.3
 # Positions are mirrored if the mirror image of the map fits them this many times as well.
 _MIRRORED = 3.0
-_POINT, _CHECK_POINT = "control point", "check point"
+_POINT, _CHECK_POINT, _FRAME = "control point", "check point", "frame of the points"
+_OF_ALL = ""  # subject of a test of all points
+_ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
 # Words, remedy and unit of the mistakes of an antenna's positions.
 _OF_ANTENNA = {
@@ -86,6 +89,7 @@ class PositionScale(KindOnMap):
         metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
         is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
             similarity is estimated.
+        notes: as of ``KindOnMap``.
     """
 
     known: KnownPositions
@@ -98,6 +102,7 @@ class PositionScale(KindOnMap):
     stddev_m: Array
     metres_per_unit: float
     is_at_rest: bool
+    notes: tuple[str, ...] = ()
 
     kind = POSITIONS
     shows_bending = True
@@ -180,6 +185,11 @@ class PositionScale(KindOnMap):
         """True: they are in the site."""
         return True
 
+    @property
+    def is_used(self) -> bool:
+        """Whether any of them takes part; otherwise a map that others place is compared with them."""
+        return not self.known.is_check.all()
+
     def observed(
         self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
     ) -> GroupedPositions:
@@ -215,9 +225,9 @@ class PositionScale(KindOnMap):
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
 
     def entry(self, on_map: JointMap) -> Mapping[str, object]:
-        """Return how the positions of an antenna fit the map; empty without an antenna."""
+        """Return how the positions of an antenna fit the map; empty without an antenna that takes part."""
         track = self.surveyed.antenna
-        if track is None:
+        if track is None or not self.is_used:
             return {}
         mine, used = ~self.known.is_mark, ~self.known.is_mark & self.used
         off_m, is_timed = self.known.misclosures_m(on_map.estimate)[used], isinstance(track.log.moments, ByTime)
@@ -270,7 +280,9 @@ class PositionScale(KindOnMap):
         return [*(self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()), *before]
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
-        """Return the tests of each control point, of the antenna's positions, and of all against other kinds."""
+        """Return the tests of each known point, of the antenna's positions, and of all against other kinds."""
+        if self.kind not in on_map.observed:
+            return MistakeTests()
         return tests_of_positions(self, on_map, self.against_others(on_map, by_kind))
 
     @property
@@ -375,6 +387,23 @@ def fit_positions(
     return begun.fitted()
 
 
+def only_compared(
+    known: KnownPositions,
+    path: Trajectory,
+    bending: MapBending,
+    surveyed: SurveyedPositions,
+    *,
+    is_at_rest: bool,
+    metres_per_unit: float,
+    notes: tuple[str, ...],
+) -> PositionScale:
+    """Return known positions of which none takes part; arguments are as of ``PositionScale``."""
+    none, nothing = np.zeros(len(known), dtype=bool), np.zeros(len(known))
+    compared = replace(known, is_check=~none)
+    unfitted = (IDENTITY, none, nothing, nothing + 1.0)
+    return PositionScale(compared, path, bending, surveyed, *unfitted, metres_per_unit, is_at_rest, notes)
+
+
 def refuse_open_turn(covariance: Array) -> None:
     """Raise GeometryError if a (7, 7) covariance of a similarity by known positions leaves its turn open."""
     turn_stddev = float(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1]))
@@ -392,45 +421,79 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
     Args:
         on_map: all that is measured in the map. against: tests that compare the positions with other kinds.
     """
-    left_out = positions.names_left_out
-    known, threshold = positions.known, positions.threshold
-    points = np.flatnonzero(known.is_mark & (~known.is_check | np.isin(known.names, left_out))).tolist()
-    rows = [_of_point(positions, on_map, _POINT, row, threshold) for row in points]
-    rows += _of_antenna(positions, on_map)
-    # Beside others that place the map, check points are compared with the map that all hold.
-    if not any(each.places_map and each.kind != positions.kind for each in on_map.kinds):
-        rows += _of_check_points(positions, on_map, left_out)
-    reasons = [
-        f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
-        for row in rows
-        if row.rejected and row.subject in left_out
-    ]
-    of_antenna = [row for row in rows if row.rejected and row.name in _OF_ANTENNA]
-    likely = sorted(of_antenna, key=lambda row: -row.statistic)[:1]
-    likely += [row for row in rows if row.rejected and row.name == _CHECK_POINT]
-    reasons += [f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in likely]
-    if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
-        reasons.append(f"either {'; or '.join(doubted)}: {LOOK_AGAIN}")
+    # The step to the estimate may turn a map about a straight path so far that points beside it do not move linearly.
+    delivered = on_map.rejoined([each.moved(on_map.posterior) for each in on_map.kinds], on_map.estimate)
+    of_points, of_antenna = _of_points(positions, delivered), [*_of_antenna(positions, on_map)]
+    likely = sorted((row for row in of_antenna if row.rejected), key=lambda row: -row.statistic)[:1]
+    reasons = []
+    for alike in (*of_points, *([row] for row in likely)):
+        first, is_left_out = alike[0], alike[0].subject in positions.names_left_out
+        if first.rejected or is_left_out:
+            words = f"{'either' if len(alike) > 1 else 'probably'} {'; or '.join(row.words for row in alike)}"
+            ending = "; it is left out" if is_left_out else ""
+            reasons.append(f"{words} ({np.sqrt(first.statistic):.0f} stddevs): {first.remedy}{ending}")
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
-    rows += against
+    rows = [*itertools.chain.from_iterable(of_points), *of_antenna, *against]
     rows.sort(key=lambda row: row.threshold - row.statistic)
-    return MistakeTests(tuple(rows), tuple(reasons), of_place=(*reasons, *positions.surveyed.notes_on_clock))
+    notes = positions.surveyed.notes_on_clock if positions.is_used else ()
+    return MistakeTests(tuple(rows), tuple(reasons), of_place=(*reasons, *notes))
 
 
-def _of_check_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
-    """Yield the test of each check point against the control points, which it does not move."""
-    known = positions.known
-    rows = [row for row in np.flatnonzero(known.is_mark & known.is_check).tolist() if known.names[row] not in left_out]
-    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(rows), 1)))
-    for row in rows:
-        yield replace(_of_point(positions, on_map, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
+def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeTest]]:
+    """Return the tests of all known points, and of their frame where others place the map, the likeliest mistake first.
+
+    All points are compared with the map and with each other. Each is tested beside the points that were left out and
+    the mistakes that are likelier, as all explain each other's residuals in part. Control points of which either may be
+    wrong are in one group.
+    """
+    known, problem = positions.known, on_map.problem
+    marks = np.flatnonzero(known.is_mark).tolist()
+    columns = {known.names[row]: positions.columns_of(on_map, at_point(known, row)) for row in marks}
+    controls = {known.names[row] for row in marks if positions.takes_part[row]}
+    left_out = [name for name in columns if name in positions.names_left_out]
+    left = [name for name in columns if name not in left_out]
+    if len(left) > 1 and any(each.places_map and each.is_used for each in on_map.kinds if each.kind != positions.kind):
+        columns[_OF_ALL] = np.sum([columns[name] for name in left], axis=0)
+        left.append(_OF_ALL)
+    rows = np.any(np.hstack([problem.is_used[:, None], *columns.values()]), axis=1)
+    (linear, noise), gains = problem.among(rows), on_map.posterior.gains
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(columns), 1)))
+
+    def tested(some: Sequence[str], beside: Sequence[str]) -> list[MistakeTest]:
+        others = linear.with_more([columns[name][rows] for name in beside]).solved(noise.covariance_m2)
+        found = {name: others.mistake(-columns[name][rows]) for name in some}
+        by_scale = {name: gains @ columns[name][problem.is_used] for name in some}
+        tests = (_of_point(positions, name, found[name], by_scale[name], threshold) for name in some)
+        return sorted(tests, key=lambda test: -test.statistic)
+
+    groups, beside = [tested([name], [other for other in left_out if other != name]) for name in left_out], [*left_out]
+    while (tests := tested(left, beside)) and (first := tests[0]).rejected:
+        close = [test for test in tests if test.rejected and test.statistic > first.statistic - threshold]
+        alike = [test for test in close if test is first or {test.subject, first.subject} <= controls]
+        groups.append(alike)
+        beside.append(first.subject)
+        left = [test.subject for test in tests if test not in alike]
+    return [*groups, *([test] for test in tests)]
 
 
-def _of_point(positions: PositionScale, on_map: JointMap, kind: str, row: int, threshold: float) -> MistakeTest:
-    columns, name = positions.columns_of(on_map, at_point(positions.known, row)), positions.known.names[row]
-    found = on_map.problem.mistake(columns)
-    far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
-    return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
+def _of_point(
+    positions: PositionScale, name: str, found: EstimatedMistake, by_scale: Array, threshold: float
+) -> MistakeTest:
+    """Return the test of a known point, or of the frame of all of them.
+
+    Args:
+        by_scale: (3,) change of the scale's logarithm per metre of the mistake.
+    """
+    effect = np.linalg.norm(by_scale @ found.root) * np.sqrt(noncentrality(3)) if found.is_seen else np.inf
+    found = replace(found, effect_on_log_scale=float(effect) if by_scale.any() else 0.0)
+    far, axes = f"{np.linalg.norm(found.sizes):.2f} m from", in_axes(-found.sizes)
+    if name == _OF_ALL:
+        words = f"the map has all known points {far} their coordinates ({axes}), alike"
+        return row_of_mistake(_FRAME, name, found, threshold, words, _ONE_FRAME)
+    kinds = {point.name: point.kind for point in positions.surveyed.points.points}
+    kind = _CHECK_POINT if kinds.get(name) == CHECK else _POINT
+    words = f"the {kind} {name} is {far} its coordinates ({axes})"
+    return row_of_mistake(kind, name, found, threshold, words, LOOK_AGAIN)
 
 
 def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeTest]:

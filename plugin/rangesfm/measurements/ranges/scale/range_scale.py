@@ -150,7 +150,7 @@ class RangeScale(KindOnMap):
             _paper_table(solution),
             np.zeros((len(log), 0)),
         )
-        if len(on_map.observed) > 1:
+        if any(each.is_used for each in on_map.kinds if each.kind != self.kind):
             of_range = learned.spread(posed.rows, len(log)).of_range
             found = replace(found, shared_errors_m=shared_errors_m(solution, learned, of_range))
         return replace(self, told=found, notes=(*self.notes, *self._levelled(found.anchors)))
