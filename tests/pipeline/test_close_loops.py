@@ -16,6 +16,7 @@ from tests.simulated.looped import around_a_room, bent_laps, two_laps, write_mat
 from tests.simulated.surveys import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
+from rangesfm.estimation import refinement
 from rangesfm.pipeline.close_loops import close_loops_of_survey
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import refine_model
@@ -163,15 +164,20 @@ def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedL
     assert num_done > 50
 
 
-def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_found", [False, True])
+def test_where_no_loops_are_found_or_closing_them_bends_nothing_visible_the_map_stays_as_refined(
+    laps: Laps, tmp_path: Path, is_found: bool
+) -> None:
     changes = {"output.path": tmp_path / "out", "report.reference": None, "scale.max_relative_stddev": 10.0}
     listener, survey = Listener(), laps.survey.changed(changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopFinder, "propose", lambda *_, **__: {})
-        loops = refine_model(survey, progress=listener).summary.loops
-    assert listener.stages.count("refinement") == 1
-    assert loops is not None
-    assert (loops.num_proposed, loops.moved_m) == (0, 0)
+        if is_found:
+            patch.setattr(refinement, "_just_visible_m", lambda *_: 1000.0)
+        else:
+            patch.setattr(LoopFinder, "propose", lambda *_, **__: {})
+        loops = known(refine_model(survey, progress=listener).summary.loops)
+    assert listener.stages.count("refinement") == 1 + is_found
+    assert (loops.num_proposed > 0, loops.num_closed, loops.moved_m) == (is_found, 0, 0)
 
 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:

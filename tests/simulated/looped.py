@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -25,24 +25,15 @@ from tests.simulated.surveys import (
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
-from rangesfm.estimation.map_problem import MapProblem, map_problem
-from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import refine_with_ranges
-from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.cost import Ranges
-from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
-from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.options import CameraOptions
 from rangesfm.sfm.database import create_database
-from rangesfm.sfm.loops.loop_finder import LoopFinder
-from rangesfm.sfm.loops.merge import merge_tracks
-from rangesfm.sfm.loops.resection import Loop
-from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds, find_in
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.similarity import IDENTITY, rmse
@@ -93,15 +84,6 @@ class LoopedSurvey:
     def neighbours(self) -> dict[Pair, Matches]:
         """Matches of photos that the mapper matches."""
         return {pair: of for pair, of in self.matches.items() if pair[1] - pair[0] < self.max_track_length}
-
-    @property
-    def known(self) -> dict[int, set[int]]:
-        """Photos that each photo is matched with by the mapper, by its id."""
-        known: dict[int, set[int]] = {}
-        for first, second in self.neighbours:
-            known.setdefault(first, set()).add(second)
-            known.setdefault(second, set()).add(first)
-        return known
 
 
 def _pieces(seen: list[Pair], max_length: int) -> Iterable[list[Pair]]:
@@ -188,42 +170,6 @@ class ScaledMap:
         estimate = initialize_scale(observations, trajectory, anchors, anchor_frame=survey.anchor_frame)
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
-    @property
-    def ranges(self) -> Ranges:
-        estimate = self.estimate
-        # The simulated ranges have no errors but noise.
-        errors = replace(estimate.errors, learned=None)
-        return ranges_of_map(
-            self.trajectory,
-            estimate.observations,
-            estimate.metric_from_sfm,
-            TAG_IN_CAM_M,
-            estimate.anchors,
-            errors,
-            RefineOptions(),
-        )
-
-    def problem(self, model: pycolmap.Reconstruction, ranges: Ranges, *, is_refined: bool) -> MapProblem:
-        """Return the problem of a copy of a map in metres."""
-        metric = pycolmap.Reconstruction(model)
-        points = NamedPoints.in_model(metric, {}, ranges.placed_anchors, self.trajectory.frame_ids)
-        at = MapToFit(points, self.trajectory, RefineOptions())
-        return map_problem(
-            metric,
-            tuple(measured_by_radio(ranges, at)),
-            self.trajectory,
-            camera=CameraOptions(refine_intrinsics=False),
-            options=RefineOptions(),
-            first_pose_is_fixed=self.survey.is_in_first_camera,
-            is_refined=is_refined,
-            num_threads=1,
-        )
-
-    def refined(self, start: pycolmap.Reconstruction | None = None) -> MapAtRest:
-        """Refine the scaled map, or another map in metres."""
-        model = self.scaled if start is None else start
-        return refine(self.problem(model, self.ranges, is_refined=start is not None))
-
     def refined_by_default(self) -> pycolmap.Reconstruction:
         """Refine the scaled map with the errors of ranges that the scale stage found."""
         estimate = self.estimate
@@ -245,88 +191,6 @@ class ScaledMap:
         """Return the root mean square error of the keyframes, without alignment."""
         truth = self.survey.model
         return rmse(trajectory_from_reconstruction(model, truth.timestamps_s).centers - truth.centers_m)
-
-
-@dataclass(frozen=True)
-class SimulatedMap:
-    """A refined map of a simulated survey, whose loops can be closed.
-
-    Attributes:
-        looped: the survey. scaled: its map before.
-        at_rest: the map.
-        matches: of all pairs that look alike. database_path: for the matches of those that are used.
-    """
-
-    looped: LoopedSurvey
-    scaled: ScaledMap
-    at_rest: MapAtRest
-    matches: dict[Pair, Matches]
-    database_path: Path
-
-    @property
-    def model(self) -> pycolmap.Reconstruction:
-        return self.at_rest.problem.metric
-
-    @cached_property
-    def finder(self) -> LoopFinder:
-        covariance = joint_errors(self.at_rest, 1.0)
-        pixel_stddev = self.at_rest.pixel_stddev
-        return LoopFinder.in_refined_map(self.model, self.scaled.trajectory, covariance, pixel_stddev, seed=0)
-
-    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
-        return find_in(self.finder, self.matches_of, self.looped.known, tried)
-
-    def matches_of(self, pairs: Iterable[Pair]) -> dict[Pair, Matches]:
-        return {pair: self.matches[pair] for pair in pairs if pair in self.matches}
-
-    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> SimulatedMap | None:
-        path = self.database_path
-        path.unlink(missing_ok=True)
-        write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
-        ranges = self.scaled.ranges.at_blocks(self.at_rest.state.blocks)
-        problem = self.scaled.problem(self.model, ranges, is_refined=True)
-        rest = refine_with_loops(
-            problem,
-            problem.like(self.at_rest.problem),
-            self.finder.relative_poses(loops),
-            lambda model: merge_tracks(model, path, seed=0),
-        )
-        return None if rest is None else replace(self, at_rest=rest)
-
-
-@dataclass(frozen=True)
-class Closed:
-    """A refined survey before and after its loops are closed.
-
-    Attributes:
-        before, after: the maps.
-        tried: pairs that the maps proposed, and what became of them.
-    """
-
-    before: SimulatedMap
-    after: SimulatedMap
-    tried: TriedPairs
-
-
-def close(
-    looped: LoopedSurvey,
-    chain: pycolmap.Reconstruction,
-    log: RangeLog,
-    folder: Path,
-    *,
-    alike: dict[Pair, Matches] | None = None,
-) -> Closed:
-    """Scale and refine a chain, then close its loops.
-
-    Args:
-        folder: for the database.
-        alike: matches of further pairs, which do not show the same place.
-    """
-    scaled = ScaledMap.of(looped.survey, chain, log)
-    matches = looped.matches | (alike or {})
-    before = SimulatedMap(looped, scaled, scaled.refined(), matches, folder / "database.db")
-    after, tried = close_in_rounds(before)
-    return Closed(before, after, tried)
 
 
 def two_laps(
