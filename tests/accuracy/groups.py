@@ -123,7 +123,7 @@ def log_tasks(data: Path | None, quick: bool) -> list[Task]:
 
 
 def one_drifting_map(kind: str, seed: int, data: Path | None) -> Cases:
-    line = drifting_maps.told(drifting_maps.surveys(data)[kind](seed), kind, seed)
+    line = drifting_maps.told(kind, seed, data)
     if line["refused"]:
         return {f"{kind} {seed}": REFUSED}
     is_nearer = line["refined_m"] is not None and line["refined_m"] < line["scaled_m"]

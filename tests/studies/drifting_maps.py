@@ -15,10 +15,23 @@ bundle adjustment of them bends and drifts, and radios have errors.
 - ``desk``: real monocular keyframes (ORB-SLAM on TUM's fr2_desk), scaled only, with four surveyed anchors around the
   desk and simulated ranges of 0.08 m. Needs --data.
 
-Prints for each kind: how many refined maps are nearer to the truth than the scaled map, and how many of these are kept;
+The others have no ranges. They are laps like those above with 90 photos and a drift of 0.5, 1, 2 or 5 m, and have one
+of these alone:
+
+- ``positions``: of an antenna on the camera, with noise of 0.02, 0.1 and 1 m as stated, of each photo (even seeds) or
+  two a second with times of the camera's clock (odd ones);
+- ``receiver``: of an antenna with 0.05 m of noise, which is stated, and as much again that lasts for 20 s;
+- ``points``: 6, 8, 10 or 12 control points along the path, each clicked in up to four photos with an error of one
+  pixel, and surveyed to 1 cm;
+- ``lengths``: 4, 6 or 8 taped lengths of some metres between such marks, each measured to 5 mm. They tell the scale of
+  the map where they are, and nothing of its turns.
+
+Prints for each kind: the median drift (after the similarity that fits the unscaled map best) and the median error of
+the delivered map; how many refined maps are nearer to the truth than the scaled map, and how many of these are kept;
 how many of the delivered scales lie in their 95 % interval, and its median half width; errors of scale and of keyframes
 in their stated stddevs (root mean square: 1 if the stddevs are honest); and how many surveys are doubted, and have a
-mistake named. With --out each run is a line of a file, and runs that are there already are not repeated.
+mistake named. With --out each run is a line of a file, and runs that are there already are not repeated. Exit status 1
+if fewer than 90 % of the scales are covered.
 """
 
 from __future__ import annotations
@@ -26,7 +39,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +48,33 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from tests.simulated.path import lap_path
 from tests.simulated.runs import run_stages
-from tests.simulated.surveys import HALL, TAG_IN_CAM_M, Kind, MadeSurvey, expected_drift_m, in_turn, made, truth_of
+from tests.simulated.surveys import (
+    HALL,
+    TAG_IN_CAM_M,
+    Kind,
+    MadeSurvey,
+    Truth,
+    expected_drift_m,
+    in_turn,
+    made,
+    truth_of,
+)
 from tests.studies.kept_runs import run_seeds, seeds_parser
+from tests.studies.known_positions import NO_RANGES, POINT_STDDEV_M, RECEIVERS, Receiver
+from tests.studies.measured_distances import MAST_M, marks_in
 
-from rangesfm.errors import GeometryError, SolverError
+from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.errors import RangesfmError
+from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
+from rangesfm.options import RangesOptions
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import align_points, rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -46,9 +82,17 @@ Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
 
 LEVELS_M = (0.2, 0.5, 1.0, 2.0, 5.0, 15.0)
-MAST_M = {"A1": (10.0, 5.0, 8.0)}
 # At heights that distinguish the map from its mirror image.
 ROUND_THE_FIELD_M = {"N": (5.0, 52.0, 14.0), "E": (68.0, -4.0, 2.0), "S": (-8.0, -50.0, 18.0), "W": (-66.0, 9.0, 4.0)}
+
+# Of the laps without ranges.
+LEVELS_WITHOUT_RANGES_M = (0.5, 1.0, 2.0, 5.0)
+NOISES_M = (0.02, 0.1, 1.0)
+NUM_POINTS, NUM_LENGTHS = (6, 8, 10, 12), (4, 6, 8)
+NUM_KEYFRAMES, DURATION_S, LENGTH_STDDEV_M = 90, 120.0, 0.005
+TAPED_M = (3.0, 25.0)
+LEAST_COVERED = 0.9
+WITHOUT_RANGES = ("positions", "receiver", "points", "lengths")
 
 
 def lap(seed: int, anchor_frame: str = "first_camera", *, with_radio: bool = False) -> MadeSurvey:
@@ -115,12 +159,111 @@ def desk(folder: Path, seed: int) -> MadeSurvey:
     return survey
 
 
-def told(survey: MadeSurvey, kind: str, seed: int) -> Line:
+@dataclass(frozen=True)
+class LapWithoutRanges:
+    """A lap around a field, and its map."""
+
+    path: CameraPath
+    truth: Truth
+    survey: MadeSurvey
+    seed: int
+
+    @classmethod
+    def of(cls, kind: str, seed: int) -> LapWithoutRanges:
+        level_m = LEVELS_WITHOUT_RANGES_M[seed % len(LEVELS_WITHOUT_RANGES_M)]
+        frame = "unknown" if kind == "lengths" else "site"
+        path, times = lap_path(DURATION_S, share=0.98), np.linspace(0.0, DURATION_S, NUM_KEYFRAMES)
+        in_site, truth = (truth_of(path, times, ROUND_THE_FIELD_M, each, 80, (6.0, 40.0)) for each in ("site", frame))
+        survey = made(truth, path, times, level_m / expected_drift_m(in_site), seed, with_radio=False)
+        return cls(path, truth, survey, seed)
+
+    @property
+    def rng(self) -> np.random.Generator:
+        return np.random.default_rng([self.seed, 41])
+
+    def positions(self, receiver: Receiver) -> SurveyedPositions:
+        """Return positions of the antenna with its noise as stated: of each photo, or two a second."""
+        of_photos = self.seed % 2 == 0
+        times = np.array(list(self.truth.model.timestamps_s.values()))
+        if not of_photos:
+            times = np.arange(times[0] + 0.2, times[-1], 0.5)
+        at_m = self.path.centers(times) + self.path.world_from_cam(times) @ TAG_IN_CAM_M
+        at_m = at_m + receiver.errors_m(times, self.rng)
+        covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
+        moments = ByPhoto(self.survey.trajectory.image_names) if of_photos else ByTime(times)
+        log = PositionLog(at_m, covariances, moments, np.arange(len(times)))
+        offset = None if of_photos else TimeOffset.given(0.0)
+        return SurveyedPositions(antenna=AntennaTrack(log, TAG_IN_CAM_M, offset, RangesOptions()))
+
+    def marks(self, num: int) -> tuple[dict[str, Marker], dict[str, Array]]:
+        """Return marks and their true positions, evenly along the path."""
+        markers, true_m = marks_in(self.truth, self.rng)
+        along = sorted(markers, key=lambda name: markers[name].image_names[0])
+        chosen = [along[k] for k in np.linspace(0, len(along) - 1, num).round().astype(int)]
+        return {name: markers[name] for name in chosen}, {name: true_m[name] for name in chosen}
+
+    def points(self, num: int) -> SurveyedPositions:
+        markers, true_m = self.marks(num)
+        points = (
+            ControlPoint(name, at + POINT_STDDEV_M * self.rng.standard_normal(3), POINT_STDDEV_M, CONTROL, 0)
+            for name, at in true_m.items()
+        )
+        return SurveyedPositions(ControlPoints(tuple(points), markers))
+
+    def lengths(self, num: int) -> Tape:
+        """Return lengths between marks that are near each other, along the path."""
+        model, rng = self.truth.model.reconstruction, self.rng
+        ids = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 4]
+        places = np.array([model.point3D(i).xyz for i in ids])
+        markers: dict[str, Marker] = {}
+        taped = []
+        for start in np.linspace(0, len(ids) - 1, num + 2).round().astype(int)[1:-1].tolist():
+            apart_m = np.linalg.norm(places - places[start], axis=1)
+            other = int(rng.choice(np.flatnonzero((apart_m > TAPED_M[0]) & (apart_m < TAPED_M[1]))))
+            for k in (start, other):
+                markers[f"mark{k}"] = self._clicked(ids[k], rng)
+            measured_m = float(apart_m[other]) + LENGTH_STDDEV_M * float(rng.standard_normal())
+            taped.append(TapedDistance((f"mark{start}", f"mark{other}"), measured_m, LENGTH_STDDEV_M, CONTROL, 0))
+        return Tape(tuple(taped), markers)
+
+    def _clicked(self, point_id: int, rng: np.random.Generator) -> Marker:
+        model = self.truth.model.reconstruction
+        point = model.point3D(point_id)
+        images = [model.image(element.image_id) for element in point.track.elements][:4]
+        pixels = np.array([image.project_point(point.xyz) for image in images], np.float64)
+        return Marker(
+            tuple(image.name for image in images),
+            pixels + rng.standard_normal(pixels.shape),
+            (0,) * len(images),
+            1.0,
+        )
+
+    def inputs(self, kind: str) -> RangingInputs:
+        """Return what is measured in a survey of a kind; successive seeds go through the numbers of it."""
+        which, tape, known = self.seed // len(LEVELS_WITHOUT_RANGES_M), Tape(), SurveyedPositions()
+        if kind == "positions":
+            known = self.positions(Receiver(NOISES_M[which % len(NOISES_M)], 0.0, 1.0))
+        elif kind == "receiver":
+            known = self.positions(RECEIVERS["positions"])
+        elif kind == "points":
+            known = self.points(NUM_POINTS[which % len(NUM_POINTS)])
+        else:
+            tape = self.lengths(NUM_LENGTHS[which % len(NUM_LENGTHS)])
+        return RangingInputs(NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), tape, positions=known)
+
+
+def told(kind: str, seed: int, data: Path | None = None) -> Line:
     """Run a survey, and return the figures that the report needs."""
-    line: Line = {"kind": kind, "seed": seed}
+    if kind in WITHOUT_RANGES:
+        lap = LapWithoutRanges.of(kind, seed)
+        survey, inputs = lap.survey, lap.inputs(kind)
+    else:
+        survey, inputs = surveys(data)[kind](seed), None
+    unscaled = align_points(survey.trajectory.centers, survey.true_centers_m).apply(survey.trajectory.centers)
+    line: Line = {"kind": kind, "seed": seed, "drift_m": rmse(unscaled - survey.true_centers_m)}
     try:
-        metric = run_stages(survey, seed)
-    except (GeometryError, SolverError) as error:
+        metric = run_stages(survey, seed, inputs)
+    except RangesfmError as error:
         return {**line, "refused": str(error)}
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
     estimate, refined = metric.estimate, metric.refined
@@ -164,7 +307,7 @@ def _covered(off_m: Array, covariances: Array) -> float:
 
 
 def surveys(data: Path | None) -> dict[str, Callable[[int], MadeSurvey]]:
-    """Functions that simulate a survey, by kind."""
+    """Functions that simulate a survey with ranges, by kind."""
     found: dict[str, Callable[[int], MadeSurvey]] = {
         "lap": lap,
         "lap_unknown": lambda seed: lap(seed, "unknown"),
@@ -192,7 +335,9 @@ def report(lines: list[Line]) -> Iterator[str]:
         places = [line["places"] for line in judged if line["places"] is not None]
         share = [line["places_covered"] for line in judged if line["places_covered"] is not None]
         yield (
-            f"{kind:12}{len(own):4} runs, {len(own) - len(judged)} refused; nearer to the truth {len(nearer)} of "
+            f"{kind:12}{len(own):4} runs, {len(own) - len(judged)} refused; drift "
+            f"{np.median([line['drift_m'] for line in judged]):.2f} m, delivered "
+            f"{np.median([line['final_m'] for line in judged]):.3f} m; nearer to the truth {len(nearer)} of "
             f"{len(refined)} refined, of these kept {sum(line['kept'] for line in nearer)}; scale covered "
             f"{100 * np.mean([line['covered'] for line in judged]):.0f} %, half width "
             f"{100 * np.median([line['half_width'] for line in judged]):.2f} %, errors in stddevs "
@@ -207,10 +352,11 @@ def main() -> int:
     parser = seeds_parser(__doc__, None, 6)
     parser.add_argument("--data", type=Path)
     asked = parser.parse_args()
-    makers = surveys(asked.data)
-    lines = run_seeds(asked, asked.kinds or makers, lambda kind, seed: told(makers[kind](seed), kind, seed), json.dumps)
+    kinds = asked.kinds or [*surveys(asked.data), *WITHOUT_RANGES]
+    lines = run_seeds(asked, kinds, lambda kind, seed: told(kind, seed, asked.data), json.dumps)
     print(*report(lines), sep="\n")
-    return 0
+    covered = [line["covered"] for line in lines if not line["refused"]]
+    return int(not covered or float(np.mean(covered)) < LEAST_COVERED)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import HALL, SITE_ANCHORS_M, Kind, Truth, simulated
-from tests.studies.drifting_maps import MAST_M
 from tests.studies.kept_runs import run_seeds, seeds_parser
 
 from rangesfm.demo.simulated_radio import CameraPath
@@ -50,6 +49,7 @@ Z_95 = 1.96
 ROOM_M = {f"R{k}": (x, y, z) for k, (x, y, z) in enumerate(
     [(2.4, 2.9, 2.2), (-2.4, 2.8, 0.4), (-2.3, -2.9, 2.3), (2.5, -2.7, 0.3), (0.1, 3.0, 1.3), (0.0, -3.0, 0.8)], 1
 )}  # fmt: skip
+MAST_M = {"A1": (10.0, 5.0, 8.0)}
 ALONG_M = {"B1": (-5.0, 8.0, 3.0), "B2": (15.0, -9.0, 1.0), "B3": (35.0, 9.0, 4.0), "B4": (55.0, -8.0, 0.5)}
 
 
