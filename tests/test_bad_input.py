@@ -145,7 +145,7 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         ),
         (set_line("anchors.csv", 3, "A1,1,2,3"), r"/anchors.csv:3: anchor A1 is in line 2 already"),
         (set_line("images.csv", 4, "frame_00001.jpg,7"), r"/images.csv:4: frame_00001.jpg is in line 2 already"),
-        (set_line("images.csv", 4, "frame_00003.jpg,x"), r"/images.csv:4: timestamp_s is 'x', expected a number"),
+        (set_line("images.csv", 4, "frame_00003.jpg,x"), r"/images.csv:4: timestamp_s is 'x', expected a time in s"),
         (
             write("images.csv", "image_name,timestamp_s\nother.jpg,1\n"),
             r"/images.csv: none of the model's photos has a time, the first is frame_00001.jpg",

@@ -103,15 +103,15 @@ class TestCsv:
             ("image_name,size_px\na.jpg,1\n", "no columns of photo times; found image_name, size_px"),
             (
                 "image_name,timestamp_s\na.jpg,noon\n",
-                "images.csv:2: timestamp_s is 'noon', expected a number",
+                "images.csv:2: timestamp_s is 'noon', expected a time in s",
             ),
             (
                 "image_name,timestamp_s\na.jpg,1\n\nb.jpg,nan\n",
-                "images.csv:4: timestamp_s is nan, expected a number",
+                "images.csv:4: timestamp_s is nan, expected a time in s",
             ),
-            ("image_name,timestamp_s\na.jpg,\n", "images.csv:2: timestamp_s is empty, expected a number"),
+            ("image_name,timestamp_s\na.jpg,\n", "images.csv:2: timestamp_s is empty, expected a time in s"),
             ("image_name,timestamp_s\n,1\n", "images.csv:2: image_name is empty"),
-            ("image_name,timestamp_s\na.jpg,1.4e18\n", "images.csv:2: timestamp_s is 1.4e18, expected a number"),
+            ("image_name,timestamp_s\na.jpg,1.4e18\n", "images.csv:2: timestamp_s is 1.4e18, expected a time in s"),
             ("image_name,timestamp_s\na.jpg,1\na.jpg,2\n", "images.csv:3: a.jpg is in line 2 already"),
             (
                 "image_name,timestamp_s\na.jpg,1\nb.jpg,1.0\n",

@@ -22,7 +22,6 @@ from rangesfm.measurements.ranges.readers.lists import (
     times_by_row,
 )
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
-from rangesfm.options import TIME_S
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable, read_head
 
@@ -48,8 +47,8 @@ def read_photo_list(
     """
     path = Path(path)
     table = PHOTO_TIMES.read(path, columns)
-    if not columns and unit is None and PHOTO_TIMES.is_canonical(read_head(path)):
-        return _with_resolution(table, table.numbers("timestamp", bounds=TIME_S), "s")
+    if not columns and PHOTO_TIMES.is_canonical(read_head(path)):
+        unit = unit or "s"
     times_s, unit, notes = times_by_row(table, PHOTO_TIMES.what, unit, "--image_times_unit")
     return _with_resolution(replace(table, notes=(*table.notes, *notes)), times_s, unit)
 

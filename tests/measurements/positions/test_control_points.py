@@ -89,7 +89,10 @@ def test_the_list_of_odm_has_coordinates_pixels_and_a_coordinate_system(
         ("marker,x_m,y_m,z_m,kind\nA,1,2,3,held\n", "points.txt:2: kind is 'held', expected control or check"),
         ("marker,x_m,y_m,z_m\nA,1,,3\n", "points.txt:2: y_m is empty, expected"),
         ("marker,x_m,y_m,z_m,stddev_m\nA,1,2,3,-1\n", "points.txt:2: stddev_m is -1, expected"),
-        ("EPSG:32632\n1 2 3 4 5 a.jpg\n1 2 three 4 5 a.jpg\n", "points.txt:3: is no line of a point, expected geo_x"),
+        (
+            "EPSG:32632\n1 2 3 4 5 a.jpg\n1 2 three 4 5 a.jpg\n",
+            "points.txt:3: geo_z is 'three', expected a number of metres",
+        ),
         ("EPSG:32632\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P\n", "points.txt:3: point P has other coordinates than in"),
         ("EPSG:32632\n1 2 3 4 5 a.jpg P\n1 2 3 4 6 a.jpg P\n", "points.txt:3: marker P is twice in a.jpg"),
     ],

@@ -100,7 +100,7 @@ def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> N
         found.covariance_m2[0], [[1e-4, -1e-4, 4e-6], [-1e-4, 4e-4, 9e-6], [4e-6, 9e-6, 25e-4]], atol=1e-12
     )
     assert "GPS time, which is ahead of UTC" in found.notes[0]
-    with pytest.raises(InputError, match=r"positions.txt:2: is no row of an RTKLIB solution"):
+    with pytest.raises(InputError, match=r"positions.txt:2: has 4 cells, expected date time latitude"):
         read(tmp_path, f"{names}\n2024/03/01 00:00:05.500 47.06 -1.35\n")
 
 

@@ -118,8 +118,8 @@ def test_a_reference_by_time_needs_photos_with_times() -> None:
         ("r.csv", "image_name,x_m,y_m,z_m\na,1,2,3\na,1,2,3\n", r"r\.csv:3: image_name is 'a'"),
         ("r.csv", "image_name,x_m,y_m,z_m,qx,qy,qz\na,1,2,3,0,0,0\n", "no column qw"),
         ("r.csv", "image_name,x_m,y_m,z_m,qx,qy,qz,qw\na,1,2,3,0,0,0,0\n", r"r\.csv:2: the quaternion .* length 0"),
-        ("r.tum", "# nothing\n", "no pose"),
-        ("r.tum", "1 2 3 4 0 0 0 1\n\n2 2 3 4\n", r"r\.tum:3: 4 numbers, expected 8"),
+        ("r.tum", "# nothing\n", "holds no row"),
+        ("r.tum", "1 2 3 4 0 0 0 1\n\n2 2 3 4\n", r"r\.tum:3: has 4 cells, expected timestamp_s x_m"),
         ("r.tum", "1 2 x 4 0 0 0 1\n", r"r\.tum:1: y_m is 'x'"),
     ],
 )

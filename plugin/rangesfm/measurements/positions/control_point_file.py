@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +11,16 @@ from rangesfm.measurements.lengths.metashape import is_metashape_file, read_meta
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, Mark
 from rangesfm.measurements.lengths.tape_file import markers_of_marks
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.measurements.positions.position_log import crs_in_text, crs_of_line
+from rangesfm.measurements.positions.position_log import crs_in_head, crs_in_text, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.anchor_file import find_or_ask
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, UnclearListError, metres
 from rangesfm.measurements.ranges.readers.vocabulary import KIND
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
-from rangesfm.util.files.text_tables import TextTable, is_number, read_head, read_text, repeated
+from rangesfm.util.files.text_tables import TextTable, is_number, read_head, read_without_header, repeated
 
 _KINDS = (CONTROL, CHECK)
-_NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
+_GCP_COLUMNS = ("geo_x", "geo_y", "geo_z", "im_x", "im_y", "image_name")
 
 
 def read_control_points(options: PointOptions) -> ControlPoints:
@@ -51,7 +50,7 @@ def is_gcp_list(head: str) -> bool:
     """Return whether a file with this beginning is ODM's list of ground control points."""
     first, *rows = [line for line in head.split("\n") if line.strip() and not line.startswith("#")] or [""]
     cells = [row.split() for row in rows]
-    are_points = any(len(row) > _NUM_GCP_NUMBERS and all(map(is_number, row[:_NUM_GCP_NUMBERS])) for row in cells)
+    are_points = any(len(row) >= len(_GCP_COLUMNS) and all(map(is_number, row[:5])) for row in cells)
     return bool(crs_of_line(first)) and are_points
 
 
@@ -109,23 +108,22 @@ def _gcp_list(path: Path, options: PointOptions) -> ControlPoints:
 
     A point without a name is known by its coordinates.
     """
-    crs, points, marks = "", dict[str, ControlPoint](), dict[str, list[Mark]]()
-    for line, text in enumerate(read_text(path).split("\n"), 1):
-        if not text.strip() or text.lstrip().startswith("#"):
-            continue
-        if not crs:
-            crs = crs_of_line(text)
-            continue
-        numbers, image_name, rest = _cells_of_gcp(text, path, line)
-        name = rest or next(
-            (known.name for known in points.values() if known.position_m.tolist() == numbers[:3]),
-            f"point {len(points) + 1}",
+    table = read_without_header(path, _GCP_COLUMNS, ("gcp_name",), has_more=True, is_no_row=is_no_row)
+    bounds = [COORDINATE_M] * 3 + [PIXEL] * 2
+    numbers = np.column_stack([table.numbers(name, bounds=each) for name, each in zip(_GCP_COLUMNS, bounds)])
+    points, marks = dict[str, ControlPoint](), dict[str, list[Mark]]()
+    names, photos = table.text("gcp_name", empty=""), table.text("image_name")
+    for line, name, photo, row in zip(table.line.tolist(), names, photos, numbers, strict=True):
+        place, pixel = row[:3].tolist(), row[3:].tolist()
+        name = name or next(
+            (known.name for known in points.values() if known.position_m.tolist() == place), f"point {len(points) + 1}"
         )
-        point = ControlPoint(name, np.array(numbers[:3]), options.stddev_m, CONTROL, line)
-        if points.setdefault(name, point).position_m.tolist() != numbers[:3]:
+        point = ControlPoint(name, row[:3], options.stddev_m, CONTROL, line)
+        if points.setdefault(name, point).position_m.tolist() != place:
             message = f"point {name} has other coordinates than in line {points[name].line}, expected the same"
             raise InputError(message, path, line)
-        marks.setdefault(name, []).append((image_name, numbers[3:], line))
+        marks.setdefault(name, []).append((photo, pixel, line))
+    crs = crs_in_head(read_head(path))
     return ControlPoints(tuple(points.values()), markers_of_marks(marks, path), False, crs, path)
 
 
@@ -140,18 +138,3 @@ def _metashape(path: Path, options: PointOptions) -> ControlPoints:
         raise InputError("its markers have no coordinates: give them in another file, and this one by --markers", path)
     are_stated = all(stddev for _, stddev, _, _ in read.places.values())
     return ControlPoints(points, markers_of_marks(read.seen, path), are_stated, crs_in_text(read.system), path)
-
-
-def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:
-    """Return the five numbers, the photo and the name (may be empty) of a line of ``gcp_list.txt``."""
-    cells = text.split("\t") if text.count("\t") >= _NUM_GCP_NUMBERS else text.split()
-    cells = [cell.strip() for cell in cells]
-    check: Sequence[Callable[[float], bool]] = [COORDINATE_M.hold] * 3 + [PIXEL.hold] * 2
-    try:
-        numbers = [float(cell) for cell in cells[:_NUM_GCP_NUMBERS]]
-        is_right = len(cells) > _NUM_GCP_NUMBERS and all(holds(x) for holds, x in zip(check, numbers, strict=True))
-    except ValueError:
-        is_right = False
-    if not is_right:
-        raise InputError(f"is no line of a point, expected {_GCP_COLUMNS}", path, line)
-    return numbers, cells[_NUM_GCP_NUMBERS], cells[_NUM_GCP_NUMBERS + 1] if len(cells) > _NUM_GCP_NUMBERS + 1 else ""

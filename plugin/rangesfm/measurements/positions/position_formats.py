@@ -7,7 +7,7 @@ write tables with names of columns, which are recognised like those of range log
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -23,20 +23,20 @@ from rangesfm.measurements.positions.position_columns import (
     find_position_columns,
     is_degrees,
 )
-from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
+from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.layout import MISSING
 from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, metres, times_by_row
-from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.option_model import Bounds
-from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
+from rangesfm.options import COORDINATE_M, STDDEV_M, PositionOptions
 from rangesfm.util.files.text_tables import (
     TextTable,
     header_names,
     is_number,
     read_head,
     read_text,
+    read_without_header,
 )
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
@@ -95,34 +95,41 @@ def is_of_positions(head: str) -> bool:
 
 
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
-    head = read_head(path)
-    table = _POSITIONS.read(path, options.columns, options.unit, every_row=False)
-    notes = [*table.notes]
-    if "timestamp" not in table:
-        moments: Moments = ByPhoto(tuple(table.text("image_name")))
-    elif not (options.columns or options.unit or options.timestamp_unit) and _POSITIONS.is_canonical(head):
-        moments = ByTime(table.numbers("timestamp", bounds=TIME_S))
+    given = options.columns or options.unit or options.timestamp_unit
+    unit = "s" if not given and _POSITIONS.is_canonical(read_head(path)) else options.timestamp_unit
+    return _log_of_table(_POSITIONS.read(path, options.columns, options.unit, every_row=False), options, unit)
+
+
+def _log_of_table(
+    table: TextTable, options: PositionOptions, time_unit: str | None, format: str = "table"
+) -> PositionLog:
+    """Return the log in a table with columns by quantity; ``time_unit`` as for ``read_timestamps``."""
+    table = replace(table, missing=MISSING)
+    notes, crs = [*table.notes], crs_in_head(read_head(table.path))
+    if "timestamp" in table:
+        times_s, _, more = times_by_row(table, _POSITIONS.what, time_unit, "--position_time_unit")
+        moments: Moments = ByTime(times_s)
+        notes += more
     else:
-        times_s, _, more = times_by_row(table, _POSITIONS.what, options.timestamp_unit, "--position_time_unit")
-        moments, notes = ByTime(times_s), [*notes, *more]
-    crs = crs_in_head(head)
+        moments = ByPhoto(tuple(table.text("image_name")))
     kept = _of_one_tag(table, options.tag_id)
-    columns = [table.numbers(axis, empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
-    are_degrees = not (crs or options.crs) and options.unit is None and _are_degrees(table.names, columns)
-    bounds = {axis: DEGREES if are_degrees and axis != "z" else COORDINATE_M for axis in AXES}
-    for k, axis in enumerate(AXES):
-        columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[table.units[axis] or "m"]
-        table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), axis, str(bounds[axis]))
+    are_degrees = not (crs or options.crs) and options.unit is None and _are_degrees(table)
+    columns = [
+        table.numbers(axis, empty=np.nan, bounds=DEGREES)
+        if are_degrees and axis != "z"
+        else metres(table, axis, COORDINATE_M, np.nan)
+        for axis in AXES
+    ]
     position = np.column_stack(columns)
     is_lost = np.zeros(len(table), dtype=bool)
     if are_degrees or crs:  # receivers without a fix write zeros, which is in the Atlantic
         is_lost |= (position[:, 0] == 0) & (position[:, 1] == 0)
     if "quality" in table:
-        is_lost |= table.numbers("quality", empty=0.0, missing=MISSING) == 0
+        is_lost |= table.numbers("quality", empty=0.0) == 0
     position[is_lost] = np.nan
     log = PositionLog.in_time_order(
-        path,
-        "table",
+        table.path,
+        format,
         position[kept],
         moments.subset(np.flatnonzero(kept)),
         table.line[kept],
@@ -132,16 +139,16 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
     return replace(log, crs=GEOGRAPHIC if are_degrees else crs)
 
 
-def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
+def _are_degrees(table: TextTable) -> bool:
     """Return whether x and y are longitude and latitude: by their names, or where these leave it open by their spread.
 
     They are degrees if they spread over less than a survey of metres does.
     """
-    if not all(is_degrees(names[axis], axis) for axis in ("x", "y")):
+    if not all(is_degrees(table.heading(axis), axis) for axis in ("x", "y")):
         return False
-    if not any(axis in terms.words_of(names[axis]) for axis in ("x", "y")):
+    if not any(axis in terms.words_of(table.heading(axis)) for axis in ("x", "y")):
         return True
-    known = [values[np.isfinite(values)] for values in columns[:2]]
+    known = [values[np.isfinite(values)] for values in (table.numbers(axis, empty=np.nan) for axis in ("x", "y"))]
     return all(len(values) > 0 and float(np.ptp(values)) < WIDEST_DEG for values in known)
 
 
@@ -162,19 +169,20 @@ def _of_one_tag(table: TextTable, tag_id: str) -> Mask:
 
 def _covariances(table: TextTable) -> Array:
     """Return (n, 3, 3) covariances, NaN where the table has none: as a matrix, by axis, or of any coordinate."""
-    covariances = np.full((len(table), 3, 3), np.nan)
     if set(COVARIANCES) <= table.cells.keys():
         rows, columns = np.triu_indices(3)
+        covariances = np.zeros((len(table), 3, 3))
         for name, i, j in zip(COVARIANCES, rows, columns, strict=True):
             covariances[:, i, j] = covariances[:, j, i] = table.numbers(name, empty=np.nan)
         is_valid = np.isnan(covariances).any(axis=(1, 2)) | (np.linalg.eigvalsh(np.nan_to_num(covariances))[:, 0] > 0)
         table.refuse(~is_valid, "cov_xx", "a positive definite covariance")
         return covariances
-    for axis, own in enumerate(STDDEVS):
-        if (name := own if own in table else "stddev") in table:
-            stddev = metres(table, name, STDDEV_M, np.nan)
-            covariances[:, axis] = 0.0
-            covariances[:, axis, axis] = stddev**2
+    return _of_stddevs([metres(table, own if own in table else "stddev", STDDEV_M, np.nan) for own in STDDEVS])
+
+
+def _of_stddevs(stddevs_m: Sequence[Array]) -> Array:
+    """Return (n, 3, 3) covariances given three standard deviations (n,), NaN where one of these is."""
+    covariances = np.column_stack(stddevs_m)[:, :, None] ** 2 * np.eye(3)
     covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
     return covariances
 
@@ -183,11 +191,9 @@ def _is_tum(head: str) -> bool:
     return is_tum_row(header_names(head)) and is_reference_file(head)  # with a quaternion of unit length
 
 
-def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
-    table = tum_table(path)
-    times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in [*table.cells][:4])
-    at_m, unknown_m2 = np.column_stack(places), np.full((len(table), 3, 3), np.nan)
-    return PositionLog.in_time_order(path, "tum", at_m, ByTime(times_s), table.line, covariance_m2=unknown_m2)
+def _read_tum(path: Path, options: PositionOptions) -> PositionLog:
+    columns = {"timestamp": "timestamp_s", **{axis: f"{axis}_m" for axis in AXES}}
+    return _log_of_table(tum_table(path).by_quantity(columns), options, "s", "tum")
 
 
 def _is_odm(head: str) -> bool:
@@ -201,33 +207,18 @@ def _is_odm(head: str) -> bool:
 def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
     """Read ODM's ``geo.txt``: the coordinate system, then image_name geo_x geo_y geo_z [yaw pitch roll [stddevs]].
 
-    The two stddevs at the end are horizontal and vertical (docs.opendronemap.org, "Image geolocation files").
+    The two stddevs at the end are horizontal and vertical (docs.opendronemap.org, "Image geolocation files"); where
+    they are 0, they are not known.
     """
-    crs, names, lines, numbers = "", list[str](), list[int](), list[list[float]]()
-    for line, text in enumerate(read_text(path).split("\n"), 1):
-        if not text.strip() or text.startswith("#"):
-            continue
-        if not crs:
-            crs = crs_of_line(text)
-            continue
-        name, *cells = text.split("\t") if text.count("\t") > 2 else text.split()
-        try:
-            values = [float("nan" if cell.strip().lower() in MISSING else cell) for cell in cells]
-        except ValueError:
-            values = []
-        if len(values) < 3:
-            raise InputError("is no line of a photo, expected image_name geo_x geo_y geo_z", path, line)
-        names.append(name.strip())
-        lines.append(line)
-        numbers.append((values + 5 * [np.nan])[:8])
-    rows = np.array(numbers).reshape(-1, 8)
-    covariances = np.zeros((len(rows), 3, 3))
-    for axis, column in enumerate((6, 6, 7)):
-        covariances[:, axis, axis] = np.where(rows[:, column] > 0, rows[:, column], np.nan) ** 2
-    covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
-    moments = ByPhoto(tuple(names))
-    log = PositionLog.in_time_order(path, "odm", rows[:, :3], moments, lines, covariance_m2=covariances)
-    return replace(log, crs=crs)
+    more = ("yaw", "pitch", "roll", "horizontal", "vertical")
+    table = read_without_header(path, ("image_name", *AXES), more, has_more=True, is_no_row=is_no_row)
+
+    def stated(name: str) -> list[str]:
+        stddevs = table.numbers(name, empty=0.0, missing=MISSING).tolist()
+        return [cell if stddev > 0 else "" for cell, stddev in zip(table.cells[name], stddevs, strict=True)]
+
+    stddevs = dict(zip(STDDEVS, map(stated, ("horizontal", "horizontal", "vertical")), strict=True))
+    return _log_of_table(replace(table, cells={**table.cells, **stddevs}), options, None, "odm")
 
 
 def _is_marvelmind(head: str) -> bool:
@@ -244,29 +235,8 @@ def _is_marvelmind(head: str) -> bool:
 
 def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
     """Read the dashboard's CSV (operation manual, "CSV format")."""
-    rows, lines, ids = [], [], []
-    for line, text in enumerate(read_text(path).split("\n"), 1):
-        cells = text.strip().split(",")
-        if cells == [""]:
-            continue
-        try:
-            numbers = [float(cell) for cell in (cells[0], *cells[4:7])]
-        except (ValueError, IndexError):
-            raise InputError("is no line of Marvelmind's dashboard, expected time, ..., x, y, z", path, line) from None
-        if not (TIME_S.hold(numbers[0] / 1e3) and all(map(COORDINATE_M.hold, numbers[1:])) and len(numbers) == 4):
-            raise InputError("has no time and place, expected time in ms, ..., x, y, z in metres", path, line)
-        rows.append(numbers)
-        lines.append(line)
-        ids.append(cells[3].strip())
-    wanted = options.tag_id or (ids[0] if len(set(ids)) == 1 else "")
-    if wanted not in ids:
-        raise InputError(f"has positions of {', '.join(sorted(set(ids)))}: say which it is (--position_tag_id)", path)
-    kept = np.array(ids) == wanted
-    values, of_rows = np.array(rows)[kept], np.array(lines)[kept]
-    times_s, unknown_m2 = values[:, 0] / 1e3, np.full((len(values), 3, 3), np.nan)
-    return PositionLog.in_time_order(
-        path, "marvelmind", values[:, 1:], ByTime(times_s), of_rows, covariance_m2=unknown_m2
-    )
+    table = read_without_header(path, ("timestamp", "interval", "count", "tag_id", *AXES), has_more=True)
+    return _log_of_table(table, options, "ms", "marvelmind")
 
 
 def _is_nmea(head: str) -> bool:
@@ -306,7 +276,7 @@ def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
             num_broken += 1
     notes = [f"{num_broken} broken sentences are left out"] if num_broken else []
     values = np.array(rows).reshape(-1, 4)
-    covariances = np.array([np.diag(stddev**2) for stddev in stddevs]).reshape(-1, 3, 3)
+    covariances = _of_stddevs([*np.array(stddevs).reshape(-1, 3).T])
     log = PositionLog.in_time_order(
         path, "nmea", values[:, 1:], ByTime(values[:, 0]), lines, covariance_m2=covariances, notes=notes
     )
@@ -357,8 +327,7 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
 
     Source: RTKLIB manual 2.4.2, appendix B.1. The off-diagonal columns are signed roots of covariances.
     """
-    lines = read_text(path).split("\n")
-    names = _rtklib_header(lines)
+    names = _rtklib_header(read_text(path).split("\n"))
     if names is None:
         raise InputError("has no header row of an RTKLIB solution (% GPST ...)", path)
     is_geographic, is_enu = "latitude(deg)" in names, "e-baseline(m)" in names
@@ -366,32 +335,20 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
         raise InputError(
             "an RTKLIB solution with these columns is not read, expected latitude, longitude, height", path
         )
-    rows, at_lines = list[list[float]](), list[int]()
-    for line, text in enumerate(lines, 1):
-        cells = text.split()
-        if not cells or text.startswith("%"):
-            continue
+    columns = ("date", "time", *names[1:12])
+    table = read_without_header(path, columns, has_more=True, is_no_row=lambda line: line.startswith("%"))
+    values = np.column_stack([table.numbers(name) for name in columns[2:]])
+    times_s = np.zeros(len(table))
+    for row, (date, time) in enumerate(zip(table.text("date"), table.text("time"), strict=True)):
         try:
-            numbers = [float(cell) for cell in cells[2:13]]
-            rows.append([_time_of_rtklib(cells[0], cells[1]), *numbers])
-        except (ValueError, IndexError):
-            rows.append([])
-        if len(rows[-1]) < 12:
-            raise InputError(
-                "is no row of an RTKLIB solution, expected date, time, 3 coordinates, Q, ns, 6 stddevs", path, line
-            )
-        at_lines.append(line)
-    values = np.array(rows).reshape(-1, 12)
-    north_first = values[:, [2, 1, 3]] if is_geographic else values[:, 1:4]
+            times_s[row] = _time_of_rtklib(date, time)
+        except ValueError:
+            raise table.error(row, "date", "a date and a time, or a GPS week and its seconds") from None
+    east_first = values[:, [1, 0, 2]] if is_geographic else values[:, :3]
     notes = ["times are GPS time, which is ahead of UTC by leap seconds"] if names[0] == "GPST" else []
+    covariance_m2 = _covariance_of_rtklib(values[:, 5:11], is_geographic)
     log = PositionLog.in_time_order(
-        path,
-        "rtklib",
-        north_first,
-        ByTime(values[:, 0]),
-        at_lines,
-        covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
-        notes=notes,
+        path, "rtklib", east_first, ByTime(times_s), table.line, covariance_m2=covariance_m2, notes=notes
     )
     return replace(log, crs=GEOGRAPHIC if is_geographic else "")
 

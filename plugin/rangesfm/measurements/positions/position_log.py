@@ -29,6 +29,11 @@ def crs_of_line(text: str) -> str:
     return number or parameters or f"EPSG:{(326 if half.upper() == 'N' else 327) * 100 + int(zone)}"
 
 
+def is_no_row(line: str) -> bool:
+    """Return whether a line without blanks in front of it is a comment or a coordinate system."""
+    return line.startswith("#") or bool(crs_of_line(line))
+
+
 def crs_in_head(head: str) -> str:
     """Return the coordinate system that a file names before its rows: a line of its own, or a number in a comment."""
     for line in head.split("\n"):

@@ -16,7 +16,7 @@ import io
 import os
 import re
 import zlib
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from pathlib import Path
@@ -214,12 +214,51 @@ def read_table(
             continue
         cells = _split_row(row, separator, path, line)
         if len(cells) != len(names):
-            num = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
-            raise InputError(f"has {num}, the header row has {len(names)}", path, line)
+            raise InputError(f"has {num_cells(cells)}, the header row has {len(names)}", path, line)
         lines.append(line)
         for name, index in wanted.items():
             columns[name].append(cells[index])
     return TextTable(path, np.array(lines, dtype=np.int64), columns)
+
+
+def read_without_header(
+    path: AnyPath,
+    columns: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    has_more: bool = False,
+    is_no_row: Callable[[str], object] = lambda line: line.startswith("#"),
+) -> TextTable:
+    """Read a file whose columns are known and not named in it, set apart by commas, semicolons, tabs or blanks.
+
+    Args:
+        optional: columns after the others that a row may lack.
+        has_more: whether rows may have further cells, which are ignored.
+        is_no_row: says which lines are not rows, given without blanks in front of them.
+
+    Raises:
+        InputError: there is no row, or one has too few or too many cells.
+    """
+    path, expected, most = Path(path), " ".join(columns), len(columns) + len(optional)
+    lines, rows = list[int](), list[list[str]]()
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        if not text.strip() or is_no_row(text.lstrip()):
+            continue
+        ways = [text.split(separator) for separator in (",", ";", "\t", None)]
+        cells = next((cells for cells in ways if len(cells) >= len(columns)), max(ways, key=len))
+        if len(cells) < len(columns) or (len(cells) > most and not has_more):
+            raise InputError(f"has {num_cells(cells)}, expected {expected}", path, line)
+        lines.append(line)
+        rows.append([*(cell.strip() for cell in cells), *[""] * most][:most])
+    if not rows:
+        raise InputError(f"holds no row, expected {expected}", path)
+    cells_of = dict(zip((*columns, *optional), map(list, zip(*rows, strict=True)), strict=True))
+    return TextTable(path, np.array(lines, dtype=np.int64), cells_of)
+
+
+def num_cells(cells: Sequence[str]) -> str:
+    """Return how many cells a row has, for messages."""
+    return f"{len(cells)} cell{'s' * (len(cells) != 1)}"
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +21,11 @@ from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.files.text_tables import (
     FOUND,
     TextTable,
-    guess_separator,
     has_columns,
     header_names,
     read_head,
     read_table,
-    read_text,
+    read_without_header,
     repeated,
     write_table,
 )
@@ -201,20 +200,8 @@ def tum_table(path: Path) -> TextTable:
     Raises:
         InputError: a line does not have eight cells, or there is none.
     """
-    columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
-    numbered = enumerate(read_text(path).split("\n"), start=1)
-    texts = [(line, text) for line, text in numbered if text.strip() and not text.lstrip().startswith("#")]
-    separator = guess_separator(texts[0][1]) if texts else " "
-    rows = [(line, text.split(None if separator == " " else separator)) for line, text in texts]
-    if not rows:
-        raise InputError("no pose in the file, expected lines of timestamp tx ty tz qx qy qz qw", path)
-    for line, cells in rows:
-        if len(cells) != len(columns):
-            expected = f"{len(columns)} (timestamp tx ty tz qx qy qz qw, separated by blanks)"
-            raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
-    lines = np.array([line for line, _ in rows], dtype=np.int64)
-    by_name = {name: [row[i] for _, row in rows] for i, name in enumerate(columns)}
-    return TextTable(path, lines, {**by_name, columns[0]: _in_seconds(by_name[columns[0]])})
+    table = read_without_header(path, ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS))
+    return replace(table, cells={**table.cells, "timestamp_s": _in_seconds(table.cells["timestamp_s"])})
 
 
 def _in_seconds(cells: list[str]) -> list[str]:

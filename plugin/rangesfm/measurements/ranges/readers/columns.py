@@ -218,7 +218,7 @@ def read_timestamps(
     is_in_ticks = counter is not None and counter.counts_dw1000_ticks
     if counter is not None:
         taken = ", taken for the ticks of a DW1000" * (said is None and is_in_ticks)
-        notes.append(f"{table.names['timestamp']} {counter}{taken}: its times are continued")
+        notes.append(f"{table.names.get('timestamp', 'the time')} {counter}{taken}: its times are continued")
     unit = said or ("ticks" if is_in_ticks else time_unit(table.heading("timestamp"), times, notes, ask, slowest_s))
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(~TIME_S.hold(seconds), "timestamp", f"a time in {unit}")

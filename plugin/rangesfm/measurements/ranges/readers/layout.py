@@ -25,7 +25,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
 from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS
-from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, read_head, read_text
+from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, num_cells, read_head, read_text
 
 _ANGLE = re.compile(
     r"([NSEW]?) ?(-?)(\d{1,3}(?:\.\d+)?) ?(?:°|º|deg) ?(?:(\d{1,2}(?:\.\d+)?) ?['’′])? ?"
@@ -313,7 +313,7 @@ def read_rows(
     odd = [(line, row) for line, row in content if len(row) != len(header)]
     if odd and (every_row or len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content)):
         line, row = odd[0]
-        raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
+        raise InputError(f"has {num_cells(row)}, the header row has {len(header)}", path, line)
     lost = (
         [f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}"] if odd else []
     )
