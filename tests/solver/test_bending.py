@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.measurements.ranges.errors.range_bins import by_poses
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.solver.bending import WalkBending, without_similarity
 from rangesfm.util.geometry.similarity import Similarity, align_points
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import OnPath, Trajectory
 
 Array = npt.NDArray[np.float64]
 

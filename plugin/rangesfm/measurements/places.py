@@ -6,29 +6,24 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import OnPath, Trajectory
 
 
 @dataclass(frozen=True)
-class AntennaPlaces:
+class AntennaPlaces(OnPath):
     """Places of an antenna at n times.
 
     Each is ``(1 - fraction) * p_before + fraction * p_after + offset`` with ``p = center + world_from_rig @ arm``.
 
     Attributes:
-        before, after: (n,) indices of keyframes; -1 where there is no place.
-        fraction: (n,) of the later one, in [0, 1].
         interval_s: (n,) time between the two, 0 at a keyframe.
         offset_m: (n, 3) deviation of the curved path from the straight line, in the metric world; in the unit of an
             unscaled model for places of the camera on its path.
     """
 
-    before: Indices
-    after: Indices
-    fraction: Array
     interval_s: Array
     offset_m: Array
 
@@ -38,7 +33,7 @@ class AntennaPlaces:
         none = np.full(num, -1, dtype=np.int64)
         return cls(none, none, np.zeros(num), np.zeros(num), np.zeros((num, 3)))
 
-    def subset(self, rows: Indices) -> AntennaPlaces:
+    def subset(self, rows: Mask | Indices) -> AntennaPlaces:
         """Return some of the places."""
         return AntennaPlaces(*(getattr(self, field.name)[rows] for field in fields(self)))
 

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.ranges.association import is_too_long, places_on_path
+from rangesfm.measurements.ranges.association import places_on_path
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.poses import Poses
-from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around
+from rangesfm.util.geometry.trajectory import OnPath, Trajectory, places_in_time
 
 
 @dataclass(frozen=True)
@@ -58,21 +58,21 @@ class AntennaTrack:
 
 def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     """Return the positions that have a place on a path; the others are left out."""
-    rows, before, after, fraction = _places(track, path)
-    k, times_s, velocity = len(rows), path.timestamps_s, np.zeros((len(rows), 3))
+    everywhere = _places(track, path)
+    rows = np.flatnonzero(everywhere.before >= 0)
+    k, times_s, at, velocity = len(rows), path.timestamps_s, everywhere.subset(rows), np.zeros((len(rows), 3))
     arms_m = np.tile(track.antenna_in_cam_m, (k, 1))
     # The times of positions are those of a system's own epochs, so that they are exact.
-    on_path = places_on_path(path, arms_m, before, after, fraction, time_resolution_s=0.0, options=track.association)
+    on_path = places_on_path(path, arms_m, at, time_resolution_s=0.0, options=track.association)
     if times_s is None or len(path) < 2:
-        at_s = before.astype(np.float64)
+        at_s = at.before.astype(np.float64)
     else:
-        at_keyframes = np.gradient(path.centers, times_s, axis=0, edge_order=2 if len(path) > 2 else 1)
-        velocity = (1 - fraction)[:, None] * at_keyframes[before] + fraction[:, None] * at_keyframes[after]
-        at_s = times_s[before] if isinstance(track.log.moments, ByPhoto) else track.image_times_s[rows]
+        velocity = at.between(np.gradient(path.centers, times_s, axis=0, edge_order=2 if len(path) > 2 else 1))
+        at_s = times_s[at.before] if isinstance(track.log.moments, ByPhoto) else track.image_times_s[rows]
     moments = track.log.moments
     names = moments.image_name if isinstance(moments, ByPhoto) else [*map(time_text, moments.timestamp_s.tolist())]
-    interval_s = np.zeros(k) if times_s is None else times_s[after] - times_s[before]
-    places = AntennaPlaces(before, after, fraction, interval_s, on_path.offsets)
+    interval_s = np.zeros(k) if times_s is None else times_s[at.after] - times_s[at.before]
+    places = AntennaPlaces(at.before, at.after, at.fraction, interval_s, on_path.offsets)
     parts = places.by_pose(Poses(path.world_from_cam, path.centers), arms_m, np.tile(np.eye(3), (k, 1, 1)))
     return KnownPositions(
         names=tuple(names[row] for row in rows.tolist()),
@@ -89,30 +89,23 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         time_s=at_s,
         clock_stddev_s=np.full(k, track.offset_stddev_s),
         velocity=velocity,
-        world_from_cam=path.world_from_cam[np.where(fraction < 0.5, before, after)],
+        world_from_cam=path.world_from_cam[at.nearest],
         by_pose=_sparse(parts * [0, 0, 0, 1, 1, 1], places.keyframes, len(path)),
         arms_by_pose=_sparse(parts * [1, 1, 1, 0, 0, 0], places.keyframes, len(path)),
         on_path=places,
     )
 
 
-def _places(track: AntennaTrack, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
-    """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
+def _places(track: AntennaTrack, path: Trajectory) -> OnPath:
+    """Return the places of the log's positions on a path."""
     log, options = track.log, track.association
     if isinstance(log.moments, ByPhoto):
-        at = rows_of_photos(log.moments.image_name, path.image_names)
-        rows = np.flatnonzero(at >= 0)
-        return rows, at[rows], at[rows], np.zeros(len(rows))
+        return OnPath.at_keyframes(rows_of_photos(log.moments.image_name, path.image_names))
     if path.timestamps_s is None:
         raise InputError("the positions have times but the photos have none: give image times", log.path)
-    times, known = track.image_times_s, path.timestamps_s
-    before, after, fraction, nearest = keyframes_around(times, known)
-    gap = known[after] - known[before]
-    is_between: Mask = (times >= known[0]) & (times <= known[-1]) & (gap > 0) & ~is_too_long(gap, options)
-    is_at = ~is_between & (np.abs(times - known[nearest]) <= options.max_time_difference_s)
-    before, after = np.where(is_at, nearest, before), np.where(is_at, nearest, after)
-    rows = np.flatnonzero(is_between | is_at)
-    return rows, before[rows], after[rows], np.where(is_at, 0.0, fraction)[rows]
+    max_gap_s, max_difference_s = options.max_interpolation_gap_s, options.max_time_difference_s
+    known_s = path.timestamps_s
+    return places_in_time(track.image_times_s, known_s, max_gap_s=max_gap_s, max_difference_s=max_difference_s)
 
 
 def _sparse(parts: Array, on_path: Indices, num: int) -> csr_array:

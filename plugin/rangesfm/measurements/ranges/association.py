@@ -18,7 +18,7 @@ from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.motion_prior import learn_motion
 from rangesfm.util.geometry.robust_statistics import robust_stddev
-from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
+from rangesfm.util.geometry.trajectory import ROUNDING_S, OnPath, Trajectory, keyframes_around, places_in_time
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 # The early and the late half of a burst must agree to this many standard deviations for the camera to count as still.
@@ -63,12 +63,14 @@ def associate(
     """
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
     if isinstance(log.moments, ByPhoto):
-        before = after = rows_of_photos(log.moments.image_name, trajectory.image_names)
-        fraction = np.zeros(len(log))
-        status[before < 0] = RangeStatus.UNKNOWN_IMAGE
+        at = OnPath.at_keyframes(rows_of_photos(log.moments.image_name, trajectory.image_names))
+        status[at.before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:
-        times = log.moments.later(time_offset_s).timestamp_s
-        before, after, fraction = _places_by_time(log, times, trajectory.timestamps_s, options, status)
+        times, known = log.moments.later(time_offset_s).timestamp_s, trajectory.timestamps_s
+        at = _places_by_time(log, times, known, options)
+        is_inside = (times >= known[0]) & (times <= known[-1])
+        elsewhere = np.where(is_inside, RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
+        status[at.before < 0] = elsewhere[at.before < 0]
     else:
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)
     if anchor_ids is not None:
@@ -77,8 +79,7 @@ def associate(
     status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
     status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
     placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
-    before, after = np.where(placed, before, -1), np.where(placed, after, -1)
-    fraction = np.where(placed, fraction, 0.0)
+    at = at.moved(~placed, -1)
     # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
@@ -86,15 +87,14 @@ def associate(
     on_path = places_on_path(
         trajectory,
         tags_in_cam_m[placed],
-        before[placed],
-        after[placed],
-        fraction[placed],
+        at.subset(placed),
         time_resolution_s=log.time_resolution_s,
         options=options,
     )
     centers[placed], offsets[placed], stddev[placed] = on_path.centers, on_path.offsets, on_path.stddev
     lever[placed], arm_stddev_m[placed] = on_path.arms_m, on_path.arm_stddev_m
-    return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
+    on_keyframes = (at.before, at.after, at.fraction)
+    return RangeObservations(log, status, *on_keyframes, centers, offsets, lever, stddev, arm_stddev_m)
 
 
 def is_too_long(gaps_s: npt.ArrayLike, options: RangesOptions) -> Mask:
@@ -122,9 +122,7 @@ class PlacesOnPath:
 def places_on_path(
     trajectory: Trajectory,
     arms_in_cam_m: Array,
-    before: Indices,
-    after: Indices,
-    fraction: Array,
+    at: OnPath,
     *,
     time_resolution_s: float,
     options: RangesOptions,
@@ -132,48 +130,32 @@ def places_on_path(
     """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
 
     Args:
-        arms_in_cam_m: (n, 3) lever arms.
-        before, after, fraction: (n,) keyframes, and the interpolation fraction of the later one.
+        arms_in_cam_m: (n, 3) lever arms. at: all have a place.
         time_resolution_s: step to which the moments were rounded.
     """
-    num = len(before)
+    num = len(arms_in_cam_m)
     if trajectory.timestamps_s is None or len(trajectory) < 2:
-        arms_m = np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms_in_cam_m)
+        arms_m = np.einsum("nij,nj->ni", trajectory.world_from_cam[at.before], arms_in_cam_m)
         offsets, stddev, arm_stddev_m = np.zeros((num, 3)), np.zeros(num), np.zeros(num)
     else:
         is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
-        arms_m, arm_stddev_m = _interpolated_lever_arms(trajectory, arms_in_cam_m, before, fraction, is_bridged)
-        offsets, stddev = _interpolated_centers(trajectory, before, fraction, is_bridged)
-        stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, before, after, fraction, options))
-    on_line = (1 - fraction)[:, None] * trajectory.centers[before] + fraction[:, None] * trajectory.centers[after]
-    return PlacesOnPath(on_line + offsets, offsets, stddev, arms_m, arm_stddev_m)
+        arms_m, arm_stddev_m = _interpolated_lever_arms(trajectory, arms_in_cam_m, at, is_bridged)
+        offsets, stddev = _interpolated_centers(trajectory, at, is_bridged)
+        stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, at, options))
+    return PlacesOnPath(at.between(trajectory.centers) + offsets, offsets, stddev, arms_m, arm_stddev_m)
 
 
-def _places_by_time(
-    log: RangeLog, times: Array, keyframe_times: Array, options: RangesOptions, status: npt.NDArray[np.int8]
-) -> tuple[Indices, Indices, Array]:
-    """Return the keyframes before and after each time, and the fraction of the later one.
-
-    ``status`` is changed where a range has no position on the path.
-    """
-    before, after, fraction, nearest = keyframes_around(times, keyframe_times)
-    gap, distance = keyframe_times[after] - keyframe_times[before], np.abs(times - keyframe_times[nearest])
-    inside = (times >= keyframe_times[0]) & (times <= keyframe_times[-1])
-
-    at_keyframe = distance <= options.max_time_difference_s
-    interpolated = inside & ~is_too_long(gap, options)
+def _places_by_time(log: RangeLog, times: Array, keyframe_times: Array, options: RangesOptions) -> OnPath:
+    """Return the places of ranges at times (n,), also of those near a photo at which the camera stood still."""
+    max_gap_s, max_difference_s = options.max_interpolation_gap_s, options.max_time_difference_s
+    at = places_in_time(times, keyframe_times, max_gap_s=max_gap_s, max_difference_s=max_difference_s)
+    nearest = keyframes_around(times, keyframe_times).nearest
+    distance = np.abs(times - keyframe_times[nearest])
     # Standing still is tested only at keyframes with a long gap on both sides; elsewhere poses are interpolated.
     long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
-    lonely = (log.kind == RangeKind.TAG_ANCHOR) & ~interpolated & (long_gap[:-1] & long_gap[1:])[nearest]
+    lonely = (log.kind == RangeKind.TAG_ANCHOR) & (long_gap[:-1] & long_gap[1:])[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
-    same_time = distance <= min(_SAME_TIME_S, options.max_time_difference_s)
-    snapped = same_time | ((at_keyframe | still) & ~interpolated)
-
-    before, after = np.where(snapped, nearest, before), np.where(snapped, nearest, after)
-    fraction = np.where(snapped, 0.0, fraction)
-    no_place = ~(snapped | interpolated)
-    status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
-    return before, after, fraction
+    return at.moved(still | (distance <= min(_SAME_TIME_S, max_difference_s)), nearest)
 
 
 def _camera_is_still(
@@ -217,23 +199,21 @@ def _deviations(values: Array) -> Array:
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
-def _interpolated_centers(
-    trajectory: Trajectory, before: Indices, fraction: Array, is_bridged: Mask
-) -> tuple[Array, Array]:
+def _interpolated_centers(trajectory: Trajectory, at: OnPath, is_bridged: Mask) -> tuple[Array, Array]:
     """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
 
     Also returns the standard deviation (n,) of each coordinate.
     """
     assert trajectory.timestamps_s is not None, "a motion in time needs times"
     motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
-    offsets, stddev = np.zeros((len(before), 3)), np.full(len(before), motion.noise_stddev)
-    between = fraction > 0
-    offsets[between], stddev[between] = motion.beyond_chord(before[between], fraction[between])
+    offsets, stddev = np.zeros((len(at.before), 3)), np.full(len(at.before), motion.noise_stddev)
+    between = at.fraction > 0
+    offsets[between], stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])
     return offsets, stddev
 
 
 def _interpolated_lever_arms(
-    trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, fraction: Array, is_bridged: Mask
+    trajectory: Trajectory, tags_in_cam_m: Array, at: OnPath, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
 
@@ -244,26 +224,19 @@ def _interpolated_lever_arms(
     to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
     turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
     motion = learn_motion(trajectory.timestamps_s, turned, is_bridged)
-    stddev = np.full(len(before), motion.noise_stddev)
-    between = fraction > 0
-    beyond, stddev[between] = motion.beyond_chord(before[between], fraction[between])
+    stddev = np.full(len(at.before), motion.noise_stddev)
+    between = at.fraction > 0
+    beyond, stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])
     arms = tags_in_cam_m.copy()
-    turns = fraction[between, None] * to_next.as_rotvec()[before[between]] + beyond
+    turns = at.fraction[between, None] * to_next.as_rotvec()[at.before[between]] + beyond
     if len(turns):  # SciPy before 1.16 cannot make an empty set of rotations
         arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
     # A rotation moves the end of the arm in two of the three directions.
     stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
-    return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
+    return np.einsum("nij,nj->ni", trajectory.world_from_cam[at.before], arms), stddev_m
 
 
-def _timing_stddev(
-    log_resolution_s: float,
-    trajectory: Trajectory,
-    before: Indices,
-    after: Indices,
-    fraction: Array,
-    options: RangesOptions,
-) -> Array:
+def _timing_stddev(log_resolution_s: float, trajectory: Trajectory, at: OnPath, options: RangesOptions) -> Array:
     """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
 
     Uniform rounding to a step has the standard deviation step / sqrt(12). It is independent for each time.
@@ -271,11 +244,12 @@ def _timing_stddev(
     times, centers = trajectory.timestamps_s, trajectory.centers
     log_stddev_s, photo_stddev_s = log_resolution_s / np.sqrt(12), trajectory.time_resolution_s / np.sqrt(12)
     if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
-        return np.zeros(len(before))
+        return np.zeros(len(at.before))
     gaps = np.diff(times)
     # Across a long gap ranges are used only if the camera stood still.
     speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
     around = np.concatenate([[0.0], speeds, [0.0]])
-    speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
-    photo_share = np.where(before == after, 1.0, np.hypot(1 - fraction, fraction))
+    is_at, following = at.before == at.after, around[at.before + 1]
+    speed = np.where(is_at, np.maximum(around[at.before], following), following)
+    photo_share = np.where(is_at, 1.0, np.hypot(1 - at.fraction, at.fraction))
     return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))

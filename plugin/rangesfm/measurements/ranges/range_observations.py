@@ -16,6 +16,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import OnPath
 
 
 class RangeStatus(IntEnum):
@@ -39,20 +40,6 @@ class RangeStatus(IntEnum):
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Statuses of ranges that are used in the final model, with full or reduced weight."""
-
-
-@dataclass(frozen=True)
-class OnPath:
-    """Positions of n ranges on a path of keyframes: ``(1 - fraction) * before + fraction * after``."""
-
-    before: Indices
-    after: Indices
-    fraction: Array
-
-    @property
-    def nearest(self) -> Indices:
-        """Index of the nearest keyframe (n,)."""
-        return np.where(self.fraction < 0.5, self.before, self.after)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
@@ -30,7 +29,7 @@ from rangesfm.util.files.text_tables import (
     write_table,
 )
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
-from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
+from rangesfm.util.geometry.trajectory import OnPath, Trajectory, places_in_time
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
@@ -96,22 +95,20 @@ class Reference:
             has none.
         """
         if isinstance(moments, ByPhoto):
-            return self._at_index(rows_of_photos(moments.image_name, self.moments.image_name))
-        times_s, known = moments.timestamp_s, self.moments.timestamp_s
-        before, after, fraction, nearest = keyframes_around(times_s, known)
-        nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
-        positions, rotations = self._at_index(nearest)
-
-        gap = known[after] - known[before]
-        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
-        fraction = fraction[between, None]
-        start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
-        positions[between] = (1 - fraction) * start_m + fraction * end_m
-        if rotations is not None and between.any():
-            assert self.world_from_cam is not None
-            start, end = (Rotation.from_matrix(self.world_from_cam[index[between]]) for index in (before, after))
+            at = OnPath.at_keyframes(rows_of_photos(moments.image_name, self.moments.image_name))
+        else:
+            times_s, known_s = moments.timestamp_s, self.moments.timestamp_s
+            at = places_in_time(times_s, known_s, max_gap_s=max_gap_s, max_difference_s=MAX_TIME_DIFFERENCE_S)
+        is_known, positions = at.before >= 0, np.full((len(moments), 3), np.nan)
+        before, after, fraction = at.before[is_known], at.after[is_known], at.fraction[is_known, None]
+        positions[is_known] = (1 - fraction) * self.positions_m[before] + fraction * self.positions_m[after]
+        if self.world_from_cam is None:
+            return positions, None
+        rotations = np.full((len(moments), 3, 3), np.nan)
+        if len(before):  # SciPy before 1.16 cannot make an empty set of rotations
+            start, end = (Rotation.from_matrix(self.world_from_cam[index]) for index in (before, after))
             turned = start * Rotation.from_rotvec(fraction * (start.inv() * end).as_rotvec())
-            rotations[between] = turned.as_matrix()
+            rotations[is_known] = turned.as_matrix()
         return positions, rotations
 
     def why_nothing_is_known(self, of: str, moments: Moments, max_gap_s: float = 0.05) -> str:
@@ -134,10 +131,6 @@ class Reference:
             + f", the {of} are from {span_text(times_s.min(), times_s.max())}; positions are interpolated between "
             f"known times at most {max_gap_s:g} s apart"
         )
-
-    def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
-        rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
-        return _rows(self.positions_m, index), rotations
 
 
 NO_REFERENCE = Reference(np.zeros((0, 3)), ByPhoto(()))
@@ -258,10 +251,3 @@ def _rotations(table: TextTable) -> Array | None:
         raise InputError(message, table.path, int(table.line[wrong[0]]))
     rotations: Array = Rotation.from_quat(quaternions).as_matrix()
     return rotations
-
-
-def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:
-    """Return rows of ``values`` by index, and NaN for an index of -1."""
-    rows = np.full((len(index), *values.shape[1:]), np.nan)
-    rows[index >= 0] = values[index[index >= 0]]
-    return rows

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.util.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
@@ -79,8 +79,46 @@ class Trajectory:
         return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
 
 
-def keyframes_around(times: Array, keyframe_times: Array) -> tuple[Indices, Indices, Array, Indices]:
-    """Return the keyframes before and after each time (n,), the fraction of the later one, and the nearer one.
+@dataclass(frozen=True)
+class OnPath:
+    """Places of n moments on a path of keyframes: ``(1 - fraction) * before + fraction * after``.
+
+    Attributes:
+        before, after: (n,) indices of keyframes; -1 for a moment without a place.
+        fraction: (n,) of the later one, in [0, 1].
+    """
+
+    before: Indices
+    after: Indices
+    fraction: Array
+
+    @classmethod
+    def at_keyframes(cls, index: Indices) -> OnPath:
+        """Return the places of n moments at keyframes, given (n,) indices of these; -1 for no place."""
+        return cls(index, index, np.zeros(len(index)))
+
+    @property
+    def nearest(self) -> Indices:
+        """Index of the nearer keyframe (n,)."""
+        return np.where(self.fraction < 0.5, self.before, self.after)
+
+    def subset(self, rows: Mask | Indices) -> OnPath:
+        """Return some of the places."""
+        return OnPath(self.before[rows], self.after[rows], self.fraction[rows])
+
+    def between(self, values: Array) -> Array:
+        """Return the (n, d) values on the straight lines between those (k, d) of the keyframes."""
+        fraction = self.fraction[:, None]
+        return np.asarray((1 - fraction) * values[self.before] + fraction * values[self.after])
+
+    def moved(self, rows: Mask, keyframes: Indices | int) -> OnPath:
+        """Return the places with some of the moments, ``rows`` (n,), at keyframes."""
+        before, after = np.where(rows, keyframes, self.before), np.where(rows, keyframes, self.after)
+        return OnPath(before, after, np.where(rows, 0.0, self.fraction))
+
+
+def keyframes_around(times: Array, keyframe_times: Array) -> OnPath:
+    """Return the keyframes before and after each time (n,), however far they are.
 
     Times outside the path belong to its first or last two keyframes, with a fraction of 0 or 1.
     """
@@ -89,7 +127,21 @@ def keyframes_around(times: Array, keyframe_times: Array) -> tuple[Indices, Indi
     before = np.maximum(after - 1, 0)
     gap = keyframe_times[after] - keyframe_times[before]
     fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    return before, after, fraction, np.where(fraction < 0.5, before, after)
+    return OnPath(before, after, fraction)
+
+
+def places_in_time(times: Array, keyframe_times: Array, *, max_gap_s: float, max_difference_s: float) -> OnPath:
+    """Return the places of times (n,): between two keyframes that are close in time, or else at one that is near.
+
+    Args:
+        max_gap_s: longest time between two keyframes. max_difference_s: longest time to a keyframe.
+    """
+    around = keyframes_around(times, keyframe_times)
+    gap = keyframe_times[around.after] - keyframe_times[around.before]
+    is_inside = (times >= keyframe_times[0]) & (times <= keyframe_times[-1])
+    is_between = is_inside & (gap > 0) & (gap <= max_gap_s + ROUNDING_S)
+    is_near = np.abs(times - keyframe_times[around.nearest]) <= max_difference_s
+    return around.moved(~is_between, np.where(is_near, around.nearest, -1))
 
 
 def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
-from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.bending import Bending
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import OnPath
 
 NUM_POINTS, NUM_ANCHORS = 40, 3
 ARM_M = (0.1, -0.2, 0.05)

@@ -11,10 +11,10 @@ from scipy.sparse import coo_array, csr_array
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.errors.noise import MIN_NUM_OF_SCATTER
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.util.geometry.robust_statistics import robust_stddev
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import OnPath
 
 _SHORTEST_S = 0.5
 _LONGER = 1.25

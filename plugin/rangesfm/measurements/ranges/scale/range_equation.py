@@ -24,7 +24,6 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.errors.noise import bias_whitening
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.solver.linear_map import Columns
 from rangesfm.util.geometry.gravity import Gravity
@@ -32,6 +31,7 @@ from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.util.geometry.rotations import left_jacobians
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import OnPath
 
 _MAX_NUM_EVALUATIONS = 100
 

@@ -14,7 +14,6 @@ from rangesfm.measurements.ranges.errors.components import PLACES, OtherError
 from rangesfm.measurements.ranges.errors.learned import radio_components
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, range_bins
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
 from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
     RangeState,
@@ -29,6 +28,7 @@ from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component
+from rangesfm.util.geometry.trajectory import OnPath
 
 
 @dataclass(frozen=True)
