@@ -36,7 +36,7 @@ _NUM_PROBES = 12
 
 @dataclass(frozen=True)
 class KeyframeGraph:
-    """The least squares problem.
+    """The least squares problem. Its unknowns are 6 per pose (turn in its own frame, shift), then all blocks.
 
     Attributes:
         vision: information from the photos.
@@ -54,6 +54,32 @@ class KeyframeGraph:
     def start(self) -> MapState:
         """The map as it was given."""
         return MapState(self.vision.origin, self.blocks)
+
+    @cached_property
+    def starts(self) -> Indices:
+        """First column of each block, and the number of all columns."""
+        return np.cumsum([6 * len(self.vision.origin), *map(len, self.blocks.values())])
+
+    @cached_property
+    def first_of(self) -> dict[Block, int]:
+        """First column of each block, by its name."""
+        return dict(zip(self.blocks, self.starts.tolist(), strict=False))
+
+    @cached_property
+    def free(self) -> Indices:
+        """Columns that are estimated: of poses that are not held, and of blocks on which measurements depend."""
+        linear = [kind.linearize(self.start) for kind in self.kinds]
+        used = {by.blocks[k] for each in linear for by in each.by_block for k in np.unique(by.index[by.index >= 0])}
+        used = used.difference(*(kind.fixed for kind in self.kinds))
+        of_poses = np.repeat(np.arange(len(self.vision.origin)) != self.held_frame, 6)
+        of_blocks = np.repeat(np.array([name in used for name in self.blocks], dtype=bool), np.diff(self.starts))
+        return np.flatnonzero(np.concatenate([of_poses, of_blocks]))
+
+    @cached_property
+    def parts(self) -> tuple[Indices, Mask]:
+        """First free column of each pose and each block, and their number; and whether each is of a block."""
+        ends = np.unique(np.searchsorted(self.free, [*range(0, self.starts[0], 6), *self.starts]))
+        return ends, ends[1:] > np.searchsorted(self.free, self.starts[0])
 
 
 @dataclass(frozen=True)
@@ -76,16 +102,14 @@ def solve_graph(graph: KeyframeGraph, start: MapState, *, tolerance_m: float) ->
     Args:
         tolerance_m: the solver stops when no keyframe moves further in a successful step, or in all steps to come.
     """
-    layout = _Layout.of(graph, start)
     state, damping = start, _INITIAL_DAMPING
-    terms = solved = _Terms.at(graph, layout, state)
+    terms = solved = _Terms.at(graph, state)
     factored, used, step_count, movement = None, damping, 0, 0.0
     while step_count < MAX_NUM_ROUNDS and damping < _MAX_DAMPING:
         step_count += 1
-        solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping, layout.parts)
-        step = factored.solve(-terms.gradient[layout.free])
-        trial = _moved(state, layout, step)
-        trial_terms = _Terms.at(graph, layout, trial)
+        solved, used, factored = terms, damping, _factor(terms.hessian, damping, graph.parts)
+        trial = _moved(state, graph, factored.solve(-terms.gradient))
+        trial_terms = _Terms.at(graph, trial)
         if not trial_terms.cost < terms.cost:
             damping *= 10
             continue
@@ -94,8 +118,8 @@ def solve_graph(graph: KeyframeGraph, start: MapState, *, tolerance_m: float) ->
         if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
     if factored is None or used > _INITIAL_DAMPING:  # more would hide what the measurements determine
-        factored = _factor(solved.hessian_of_free, 0.0, layout.parts)
-    absorbed = tuple(_num_absorbed(rows[:, layout.free], factored) for rows in solved.whitened)
+        factored = _factor(solved.hessian, 0.0, graph.parts)
+    absorbed = tuple(_num_absorbed(rows, factored) for rows in solved.whitened)
     return GraphSolution(state, step_count, absorbed)
 
 
@@ -143,149 +167,67 @@ def _photos_alone(vision: VisionInformation) -> tuple[NestedFactor, sparse.bsr_a
 
 
 @dataclass(frozen=True)
-class _Columns:
-    """Columns of the derivatives of one kind.
-
-    Attributes:
-        of_groups: (g, e) columns of each group: of its keyframes, then of its blocks.
-        order, starts: order of the groups in which those with equal columns are together, and the first of each such
-            run, whose derivatives are multiplied at once.
-    """
-
-    of_groups: Indices
-    order: Indices
-    starts: Indices
-
-    @classmethod
-    def of(cls, linear: Linearization, first_of: dict[Block, int]) -> _Columns:
-        num = len(linear.residual)
-        parts = [(6 * linear.pose[:, :, None] + np.arange(6)).reshape(num, -1)]
-        for by in linear.by_block:
-            # A group that depends on no block has derivatives of 0, by whatever column.
-            first = np.array([first_of[name] for name in by.blocks] + [0])[by.index]
-            parts.append(first[:, None] + np.arange(by.values.shape[2]))
-        of_groups = np.concatenate(parts, axis=1).astype(np.int64)
-        alike = np.unique(of_groups, axis=0, return_inverse=True)[1].ravel()
-        order = np.argsort(alike, kind="stable")
-        return cls(of_groups, order, np.flatnonzero(np.diff(alike[order], prepend=-1)))
-
-    def rows(self, values: Array, num: int) -> sparse.csr_array:
-        """Return (g, d, e) values as (g d, num) sparse rows."""
-        num_groups, size, width = values.shape
-        columns = np.broadcast_to(self.of_groups[:, None], values.shape)
-        starts = np.arange(0, values.size + 1, width) if width else np.zeros(num_groups * size + 1, dtype=np.int64)
-        return sparse.csr_array((values.ravel(), columns.ravel(), starts), shape=(num_groups * size, num))
-
-    def squares(self, values: Array, num: int) -> sparse.coo_array:
-        """Return J^T J of (g, d, e) derivatives, from dense products within each run of equal columns."""
-        sorted_ = values[self.order]
-        runs = np.split(sorted_, self.starts[1:])
-        blocks = np.array([run.reshape(-1, run.shape[2]).T @ run.reshape(-1, run.shape[2]) for run in runs])
-        column = self.of_groups[self.order[self.starts]]
-        places = np.broadcast_to(column[:, :, None], blocks.shape), np.broadcast_to(column[:, None], blocks.shape)
-        return sparse.coo_array((blocks.ravel(), tuple(place.ravel() for place in places)), shape=(num, num))
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Order of the unknowns: 6 per pose (turn in its own frame, shift), then all blocks.
-
-    Attributes:
-        blocks: names, in order. first_of: first column of each. num: of all columns.
-        free: columns that are estimated. num_poses: n. world_is_free: whether no keyframe is held fixed.
-        of_kinds: columns of each kind.
-    """
-
-    first_of: dict[Block, int]
-    num: int
-    free: Indices
-    num_poses: int
-    world_is_free: bool
-    of_kinds: tuple[_Columns, ...]
-
-    @classmethod
-    def of(cls, graph: KeyframeGraph, start: MapState) -> _Layout:
-        linear = [kind.linearize(start) for kind in graph.kinds]
-        used = {by.blocks[k] for each in linear for by in each.by_block for k in np.unique(by.index[by.index >= 0])}
-        fixed = frozenset[Block]().union(*(kind.fixed for kind in graph.kinds))
-        n = len(graph.vision.origin)
-        first_of, num, free = dict[Block, int](), 6 * n, [np.arange(6 * n)]
-        if graph.held_frame >= 0:
-            free = [np.delete(free[0], 6 * graph.held_frame + np.arange(6))]
-        for name, at in start.blocks.items():
-            first_of[name] = num
-            num += len(at)
-            if name in used and name not in fixed:
-                free.append(np.arange(num - len(at), num))
-        of_kinds = tuple(_Columns.of(each, first_of) for each in linear)
-        return cls(first_of, num, np.concatenate(free), n, graph.held_frame < 0, of_kinds)
-
-    @property
-    def parts(self) -> tuple[Indices, Mask]:
-        """Return the first free column of each pose and each block, and whether it is of a block."""
-        num_of_poses = np.count_nonzero(self.free < 6 * self.num_poses)
-        of_blocks = np.searchsorted(self.free, [*self.first_of.values(), self.num])
-        ends = np.union1d(np.arange(0, num_of_poses + 1, 6), of_blocks)
-        return ends, ends[1:] > num_of_poses
-
-
-@dataclass(frozen=True)
 class _Terms:
-    """Cost (half the robust sum of squares), gradient and Gauss-Newton Hessian over all columns.
+    """Cost (half the robust sum of squares), gradient and Gauss-Newton Hessian over the free columns.
 
     Attributes:
-        seen: derivatives of the relative poses. vision: their information matrix.
-        values: for each kind the (g, d, e) derivatives of its residuals in standard deviations, times the roots of the
-            robust weights. whitened: the same as sparse rows.
+        graph: whose terms they are. seen: derivatives of the relative poses.
+        whitened: for each kind the derivatives of its residuals in standard deviations, times the roots of the robust
+            weights, as sparse rows.
     """
 
     cost: float
     gradient: Array
-    layout: _Layout
+    graph: KeyframeGraph
     seen: sparse.bsr_array
-    vision: sparse.bsr_array
-    values: tuple[Array, ...]
     whitened: tuple[sparse.csr_array, ...]
 
     @classmethod
-    def at(cls, graph: KeyframeGraph, layout: _Layout, state: MapState) -> _Terms:
+    def at(cls, graph: KeyframeGraph, state: MapState) -> _Terms:
         residuals, jacobian = _relative_poses(graph.vision, state.poses)
         bound = graph.vision.matrix @ residuals
         cost = 0.5 * float(residuals @ bound)
-        gradient = np.zeros(layout.num)
-        gradient[: 6 * layout.num_poses] = jacobian.T @ bound
-        values, whitened = [], []
-        for kind, columns in zip(graph.kinds, layout.of_kinds, strict=True):
+        gradient = np.zeros(graph.starts[-1])
+        gradient[: graph.starts[0]] = jacobian.T @ bound
+        gradient = gradient[graph.free]
+        whitened = []
+        for kind in graph.kinds:
             linear, weights = kind.linearize(state), kind.weights
             scaled = weights.whitened(linear.residual)
             rho, first, _ = weights.share * weights.loss.rho(np.sum(scaled**2, axis=1))
             cost += 0.5 * float(rho.sum())
             root = np.sqrt(first)[:, None]
-            own = root[:, :, None] * (weights.root_information @ _derivatives(linear))
-            rows = columns.rows(own, layout.num)
+            rows = _rows(linear, root[:, :, None] * weights.root_information, graph)
             gradient = gradient + rows.T @ (root * scaled).ravel()
-            values.append(own)
             whitened.append(rows)
-        return cls(cost, gradient, layout, jacobian, graph.vision.matrix, tuple(values), tuple(whitened))
+        return cls(cost, gradient, graph, jacobian, tuple(whitened))
 
     @cached_property
     def hessian(self) -> Array | sparse.csr_array:
         """Gauss-Newton Hessian; computed only for states from which a step is taken."""
-        total = resized(normal_matrix(self.seen, self.vision), self.layout.num)
-        for columns, values in zip(self.layout.of_kinds, self.values, strict=True):
-            total = total + columns.squares(values, self.layout.num)
-        return total
-
-    @property
-    def hessian_of_free(self) -> Array | sparse.csr_array:
-        return self.hessian[self.layout.free][:, self.layout.free]
+        graph = self.graph
+        of_all = resized(normal_matrix(self.seen, graph.vision.matrix), int(graph.starts[-1]))
+        of_free = of_all[graph.free][:, graph.free]
+        for rows in self.whitened:
+            of_free = of_free + rows.T @ rows
+        return of_free
 
 
-def _derivatives(linear: Linearization) -> Array:
-    """Return the (g, d, e) derivatives by the columns of ``_Columns.of_groups``."""
+def _rows(linear: Linearization, roots: Array, graph: KeyframeGraph) -> sparse.csr_array:
+    """Return the derivatives of g groups of d residuals, times (g, d, d) roots, as (g d, num_free) sparse rows."""
     num, size = linear.residual.shape
-    of_blocks = [np.where(by.index[:, None, None] >= 0, by.values, 0.0) for by in linear.by_block]
-    return np.concatenate([linear.by_pose.reshape(num, size, -1), *of_blocks], axis=2)
+    columns = [(6 * linear.pose[:, :, None] + np.arange(6)).reshape(num, -1)]
+    derivatives = [linear.by_pose.reshape(num, size, -1)]
+    for by in linear.by_block:
+        # A group that depends on no block has derivatives of 0, by whatever column.
+        first = np.array([graph.first_of[name] for name in by.blocks] + [0])[by.index]
+        columns.append(first[:, None] + np.arange(by.values.shape[2]))
+        derivatives.append(np.where(by.index[:, None, None] >= 0, by.values, 0.0))
+    values = roots @ np.concatenate(derivatives, axis=2)
+    indices = np.broadcast_to(np.concatenate(columns, axis=1)[:, None], values.shape)
+    starts = values.shape[2] * np.arange(num * size + 1)
+    shape = (num * size, int(graph.starts[-1]))
+    return sparse.csr_array((values.ravel(), indices.ravel(), starts), shape=shape)[:, graph.free]
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
@@ -335,7 +277,7 @@ def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Ind
     """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map.
 
     Args:
-        blocks: as ``_Layout.parts``.
+        blocks: as ``KeyframeGraph.parts``.
     """
     diagonal = hessian.diagonal()
     # The floor keeps a pose without constraints in place.
@@ -348,15 +290,13 @@ def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Ind
         return _factor(hessian, max(10 * damping, _INITIAL_DAMPING), blocks)
 
 
-def _moved(state: MapState, layout: _Layout, free_step: Array) -> MapState:
-    step = np.zeros(layout.num)
-    step[layout.free] = free_step
-    turns, shifts = np.split(step[: 6 * layout.num_poses].reshape(-1, 6), 2, axis=1)
-    moved = _turned(state.poses, turns, shifts, is_free=layout.world_is_free)
-    first_of = layout.first_of
-    return MapState(
-        moved, {name: at + step[first_of[name] : first_of[name] + len(at)] for name, at in state.blocks.items()}
-    )
+def _moved(state: MapState, graph: KeyframeGraph, free_step: Array) -> MapState:
+    step = np.zeros(graph.starts[-1])
+    step[graph.free] = free_step
+    of_poses, *of_blocks = np.split(step, graph.starts[:-1])
+    turns, shifts = np.split(of_poses.reshape(-1, 6), 2, axis=1)
+    moved = _turned(state.poses, turns, shifts, is_free=graph.held_frame < 0)
+    return MapState(moved, {name: at + by for (name, at), by in zip(state.blocks.items(), of_blocks, strict=True)})
 
 
 def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Poses:
