@@ -161,10 +161,10 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module or folder and its line in the table; no stage has to know of it."""
     assert {f"measurements.{kind}.cost" for kind in ("ranges", "lengths", "positions")} <= KINDS
     knowing = {(module, name) for module in MODULES.keys() - KINDS for name in own_imports(module) & KINDS}
-    # The public functions of ranges, and plans of positions and of a sensor.
+    # The public functions of ranges, and plans, which make measurements instead of locating them.
     of_ranges = {"estimation.scale.initialize", "estimation.with_ranges"}
     of_one_kind = {name for name in MODULES if name.startswith(("measurements.ranges.", "measurements.positions."))}
-    plans = {"planning.expected", "planning.planned_sensor"}
+    plans = {"planning.planned_kinds", "planning.planned_ranges", "planning.planned_sensor"}
     assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *plans, *of_ranges, *of_one_kind}
     logs = {"measurements.ranges.radio"}  # several kinds are in one log
     others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}

@@ -15,6 +15,7 @@ from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.planning.expected import expect
 from rangesfm.planning.paths import path_through
+from rangesfm.planning.planned_ranges import turned_out, why_place_is_open
 from rangesfm.util.geometry.similarity import Similarity
 
 
@@ -33,7 +34,7 @@ def test_the_expected_stddev_of_the_scale_is_what_runs_state(
     first = Similarity(1.0, path.world_from_cam[0], path.centers[0]).inverse()
     told = [replace(a, position_m=first.apply(at)) for a, at in zip(plan.anchors, plan.anchors_m, strict=True)]
     stated = [
-        initialize_scale(expected.turned_out(seed), path, told, anchor_frame=frame).uncertainty.empirical
+        initialize_scale(turned_out(known(expected.on_map), seed), path, told, anchor_frame=frame).uncertainty.empirical
         for seed in range(5)
     ]
     assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.3)
@@ -45,7 +46,7 @@ def test_the_expected_place_is_as_certain_as_runs_state() -> None:
     stated = []
     for seed in range(3):
         estimate = initialize_scale(
-            expected.turned_out(seed), plan.trajectory, plan.anchors, anchor_frame="site", seed=seed
+            turned_out(known(expected.on_map), seed), plan.trajectory, plan.anchors, anchor_frame="site", seed=seed
         )
         assert estimate.placement is not None
         of_keyframes = by_similarity(estimate.placement, plan.trajectory.centers)[1]
@@ -60,7 +61,8 @@ def test_ranges_that_stand_for_several_say_what_all_would() -> None:
     every = replace(plan, max_num_ranges=100_000)
     assert every.num_alike == 1
     whole = expect(every)
-    assert len(known(whole.ranges).learned.of_range) > 2 * len(known(thinned.ranges).learned.of_range)
+    num_whole, num_thinned = (len(turned_out(known(each.on_map), 0).log) for each in (whole, thinned))
+    assert num_whole > 2 * num_thinned
     assert thinned.uncertainty.empirical == pytest.approx(whole.uncertainty.empirical, rel=0.05)
     assert thinned.worst_keyframe_m == pytest.approx(whole.worst_keyframe_m, rel=0.05)
 
@@ -78,9 +80,12 @@ def test_anchors_at_the_height_of_a_level_path_leave_the_height_open() -> None:
 def test_a_flat_path_below_anchors_of_one_height_has_a_mirror_image() -> None:
     path = loop(height_amplitude_m=0.0)
     at_the_ceiling = tuple((x, y, 3.0) for x, y, _ in COPLANAR_M)
-    why = expect(planned(at_the_ceiling, "site", path)).mirror_image()
+    why, nothing = (
+        why_place_is_open(known(expect(planned(anchors_m, "site", path)).on_map))
+        for anchors_m in (at_the_ceiling, FIVE_ANCHORS_M)
+    )
     assert "mirror image" in why
-    assert expect(planned(FIVE_ANCHORS_M, "site", path)).mirror_image() == ""
+    assert nothing == ""
 
 
 def test_one_unknown_anchor_beside_a_short_straight_path_is_refused_as_a_run_would() -> None:
@@ -94,7 +99,7 @@ def test_an_unknown_anchor_in_line_with_a_straight_path_leaves_the_scale_as_open
     straight = path_through([(0.0, 0.0, 1.6), (8.0, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
     in_line = planned([(14.0, 0.0, 1.6)], "unknown", straight, rate_hz=20.0)
     expected = expect(in_line)
-    stated = initialize_scale(expected.turned_out(0), straight, in_line.anchors, anchor_frame="unknown")
+    stated = initialize_scale(turned_out(known(expected.on_map), 0), straight, in_line.anchors, anchor_frame="unknown")
     assert expected.uncertainty.empirical == pytest.approx(stated.uncertainty.empirical, rel=0.3)
 
 

@@ -16,6 +16,7 @@ from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
+from rangesfm.planning.planned_kinds import known_positions
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.solver.bending import WalkBending
@@ -41,9 +42,7 @@ def test_what_control_points_give_is_what_a_run_states_of_them() -> None:
     """Coordinates with errors as expected, on a map that bends as expected, are judged like the plan."""
     plan = by_points(12)
     expected = expect(plan)
-    known, notes = plan.known_positions()
-    assert known is not None
-    assert notes == ()
+    known = known_positions(plan)
     bending = WalkBending(in_first_camera(plan.trajectory))
     stated = []
     for seed in range(8):
@@ -97,7 +96,7 @@ def test_positions_of_the_camera_give_scale_and_place_and_their_errors_may_last(
 def test_a_point_that_the_photos_do_not_show_is_left_out_and_named() -> None:
     above = ControlPoint("above", np.array([0.0, 0.0, 50.0]), STDDEV_M, CONTROL, 9)
     expected = expect(replace(planned(FIVE_ANCHORS_M, "site", WALK), points=(*points(), above)))
-    assert expected.num_positions == 3
+    assert [each.kind for each in expected.kinds] == ["ranges", "positions"]
     assert expected.notes == (
         "1 of 4 points are left out, as no two photos of the path show them from different directions "
         "([photos] field_of_view_deg, seen_m): above",

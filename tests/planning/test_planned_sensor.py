@@ -16,7 +16,7 @@ from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
 from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.measurements.imu.sensor_prior import NOISE
-from rangesfm.planning.expected import expect
+from rangesfm.planning.expected import PlannedBending, expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.planning.survey_plan import plan_survey
@@ -40,7 +40,7 @@ def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion
     assert path.timestamps_s is not None
     turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
     true = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
-    on_map = PlannedSensor().on_map(true, WalkBending(in_first_camera(true)))
+    on_map = PlannedSensor().on_map(true, PlannedBending(WalkBending(in_first_camera(true)), {}))
     alike = replace(replace(on_map, sizes=run.sizes).alone.problem, sizes=run.alone.problem.sizes)
     assert alike.posterior().uncertainty.empirical == pytest.approx(run.alone.posterior.uncertainty.empirical, rel=0.15)
 

@@ -52,6 +52,7 @@ from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sen
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_STDDEV
+from rangesfm.planning.expected import PlannedBending
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points
@@ -110,7 +111,8 @@ def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
     tilt = float(np.linalg.norm(away)) / np.sqrt(2) / found.upward.stddev_rad
     turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
     path = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
-    planned = PlannedSensor(grade=of_grade).on_map(path, WalkBending(in_first_camera(path))).alone  # type: ignore[arg-type]
+    sensor = PlannedSensor(grade=of_grade)  # type: ignore[arg-type]
+    planned = sensor.on_map(path, PlannedBending(WalkBending(in_first_camera(path)), sensor.sizes)).alone
     widths = known.posterior.uncertainty.half_width_95, planned.posterior.uncertainty.half_width_95
     return Found(off, tilt, widths[0], "; ".join([told, *doubts]), widths[1])
 

@@ -42,6 +42,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_ranges import true_state
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -228,12 +229,12 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
 
 def truth(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
     """Return a start at the truth; a whole search takes ten times as long and ends at the same solution."""
-    state = planned.state(posed)
+    state = true_state(planned, posed)
     return replace(state, metric_from_model=replace(state.metric_from_model, scale=METRES_PER_UNIT))
 
 
 def worst_keyframe(expected: Expected) -> int | None:
-    return None if expected.known.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
+    return None if expected.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
 
 
 def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 8) -> list[Row]:

@@ -93,7 +93,7 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
     What the photos see is assumed to be the same with each change.
     """
     planned = expected.planned
-    before = expected if expected.refusal else expect_roughly(planned, expected.vision)
+    before = expected if expected.on_map is None else expect_roughly(planned, expected.vision)
 
     def tried(changes: Iterable[_Change]) -> Iterator[Advice]:
         for change in changes:

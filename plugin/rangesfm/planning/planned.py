@@ -10,33 +10,19 @@ import numpy as np
 from pydantic import Field
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.lengths.lengths_on_map import BENDING
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.control_points import ControlPoint
-from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
+from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
-from rangesfm.measurements.ranges.scale.range_equation import RangeState
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
 from rangesfm.option_model import Options
 from rangesfm.options import RangeModelOptions, RangesOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.planned_sensor import PlannedSensor
-from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.moments import ByTime
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import Trajectory
-
-# Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
-# plane. In a plan it may be, and the linearized problem would then miss what is not determined.
-_OFF_LINE_M = (0.07, 0.07, 0.1)
-
 
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]  # national grids go up to 1e7
 Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
@@ -127,11 +113,6 @@ class PlannedSurvey:
         return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64).reshape(-1, 3)
 
     @property
-    def _standing_m(self) -> Array:
-        """Positions of the anchors in the computation (m, 3)."""
-        return self.anchors_m + _OFF_LINE_M if self.anchor_frame == "unknown" else self.anchors_m
-
-    @property
     def places_m(self) -> Array:
         """Positions of all anchors, points and keyframes (m + k + n, 3)."""
         points_m = np.array([point.position_m for point in self.points], dtype=np.float64).reshape(-1, 3)
@@ -157,6 +138,19 @@ class PlannedSurvey:
         return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
 
     @property
+    def by_kind(self) -> dict[str, PlannedSurvey]:
+        """The survey with each kind of measurement alone, by its name."""
+        nothing = replace(self, anchors=(), points=(), antenna=None, sensor=None, taped=())
+        alone = {
+            "ranges": replace(nothing, anchors=self.anchors),
+            "positions": replace(nothing, points=self.points, antenna=self.antenna),
+            "lengths": replace(nothing, taped=self.taped),
+            "imu": replace(nothing, sensor=self.sensor),
+        }
+        is_any = (self.anchors, self.points or self.antenna, self.taped, self.sensor)
+        return {kind: each for (kind, each), has in zip(alone.items(), is_any, strict=True) if has}
+
+    @property
     def given_sizes(self) -> Mapping[str, float]:
         """Sizes of components of the errors that are known better than from other surveys, by name."""
         return self.component_stddevs if self.sensor is None else {**self.sensor.sizes, **self.component_stddevs}
@@ -165,77 +159,3 @@ class PlannedSurvey:
     def num_alike(self) -> int:
         """Number of ranges that each simulated one stands for."""
         return -(-self.num_ranges // self.max_num_ranges) or 1
-
-    @property
-    def site_from_first_camera(self) -> Similarity:
-        return Similarity(1.0, self.trajectory.world_from_cam[0], self.trajectory.centers[0])
-
-    def observations(self) -> RangeObservations:
-        """Simulate ranges without errors on the path; if there are many, each stands for several."""
-        num_anchors = len(self.anchors)
-        turn = np.arange(self.num_ranges // self.num_alike)
-        first_s = 0.0 if self.trajectory.timestamps_s is None else float(self.trajectory.timestamps_s[0])
-        times = first_s + (turn + 0.5) * self.num_alike / (self.rate_hz * num_anchors)
-        ids = [anchor.anchor_id for anchor in self.anchors]
-        log = RangeLog.from_arrays([ids[k] for k in turn % num_anchors], np.ones(len(turn)), timestamp_s=times)
-        places = associate(log, self.trajectory, self.tag_in_cam_m)
-        at = self._standing_m[[ids.index(anchor_id) for anchor_id in log.anchor_ids]]
-        distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
-        curve = None if self.curve_stddev_m is None else np.full(len(log), self.curve_stddev_m)
-        # A range without a position on the path is not used; it only needs a valid number.
-        measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
-        return replace(places, log=measured)
-
-    @property
-    def lasting_s(self) -> tuple[float, ...]:
-        """Times for which errors of the antenna's positions last, seconds."""
-        return LASTING_S if self.antenna is None or self.antenna.lasting_s is None else (self.antenna.lasting_s,)
-
-    def known_positions(self) -> tuple[KnownPositions, tuple[str, ...]]:
-        """Return the known positions without errors, as a run finds them in the map, and what it will leave out."""
-        known, notes = (self.photos or PlannedPhotos()).marks_of(self.trajectory, self.points), tuple[str, ...]()
-        if unseen := [point.name for point in self.points if point.name not in known.names]:
-            notes = (
-                f"{len(unseen)} of {len(self.points)} points are left out, as no two photos of the path show them "
-                f"from different directions ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
-            )
-        if self.antenna is not None:
-            known = known.joined(self.antenna.located(self.trajectory))
-        return known, notes
-
-    @property
-    def taped_lengths(self) -> LocatedDistances:
-        """Lengths that will be taped, between places that are not known yet."""
-        lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
-        # Between its ends the scale of the map varies.
-        stddevs = np.hypot(stddevs, BENDING * lengths)
-        return LocatedDistances.between_points(lengths, stddevs, lengths)
-
-    def posed(
-        self,
-        observations: RangeObservations,
-        placement: PlacementPrior | None = None,
-        gravity: Gravity | None = None,
-    ) -> ScaleProblem:
-        """Return the scale problem that a run will solve, with the input that it will have.
-
-        Args:
-            placement: what known positions say of the map's place. gravity: the upward direction; None: not known.
-
-        Raises:
-            GeometryError: the run will refuse the input.
-        """
-        from_site = self.site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
-        told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
-        given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, self.taped_lengths)
-        return scale_problem(RangesOnPath(*given, gravity=gravity), placement)
-
-    def state(self, posed: ScaleProblem) -> RangeState:
-        """Return the true state in the frame of the problem."""
-        at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
-        places = np.array([at[anchor_id] for anchor_id in posed.observations.log.anchor_ids])
-        first = self.site_from_first_camera
-        biases = posed.ranges.bias_mean_m.copy()
-        if posed.frame == "site":
-            return RangeState(first, places, biases)
-        return RangeState(IDENTITY, first.inverse().apply(places), biases)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -29,10 +28,8 @@ from rangesfm.measurements.imu.sensor_prior import (
     WALK,
     SensorPrior,
 )
-from rangesfm.measurements.joint_map import JointMap, join_kinds
 from rangesfm.option_model import Options
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.noise import usual_sizes
 from rangesfm.util.geometry.gravity import UP_IN_SITE
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -68,8 +65,8 @@ class PlannedSensor(Options, table="imu"):
             "pose_places": POSE_PLACES.usual,
         }
 
-    def on_map(self, path: Trajectory, bending: MapBending) -> PlannedScale:
-        """Return what the sensor will say of a true map.
+    def on_map(self, path: Trajectory, bending: MapBending) -> InertialScale:
+        """Return what the sensor says of a true map.
 
         It sits with its axes along those of the camera, which moves smoothly from photo to photo. What a run finds of
         its rotation, or is given, is known to a degree, and its clock to a part of a sample.
@@ -94,16 +91,4 @@ class PlannedSensor(Options, table="imu"):
         prior = SensorPrior(log.step_s / np.sqrt(12), GIVEN_TURN_STDDEV_RAD, ARM_STDDEV_M)
         problem = InertialProblem(log, path, mounting, prior, bending)
         state = replace(InertialState.at_rest(gravity, mounting, len(path)), velocities_m_s=places(times_s, 1))
-        return PlannedScale(problem, state, self.sizes, problem.summed_up(state, self.sizes))
-
-
-@dataclass(frozen=True)
-class PlannedScale(InertialScale):
-    """A planned sensor on a true map, whose errors have the planned sizes."""
-
-    @cached_property
-    def alone(self) -> JointMap:
-        """The map by the sensor alone."""
-        found = join_kinds((self,), self.problem.path, self.start, self.problem.bending)
-        problem = replace(found.problem, sizes={**usual_sizes(found.problem.components), **self.sizes})
-        return replace(found, problem=problem, posterior=problem.posterior())
+        return InertialScale(problem, state, self.sizes, problem.summed_up(state, self.sizes))

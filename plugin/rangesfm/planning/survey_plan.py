@@ -11,31 +11,21 @@ import numpy as np
 
 from rangesfm.diagnostics.place import place_in_words
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
-from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, row_of
-from rangesfm.measurements.ranges.mistakes.linearized import expected_with
-from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
 from rangesfm.planning.advice import Advice, advise, ranked
-from rangesfm.planning.expected import OPEN, Expected, expect
+from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_ranges import SIZES, mistakes, why_place_is_open
 from rangesfm.solver.mistakes import MistakeTest
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""
-ALONE = {
-    "ranges": "ranges alone",
-    "positions": "control points and positions alone",
-    "imu": "the inertial sensor alone",
-}
-"""Kinds of measurement whose result alone is planned, in words."""
 # Most lines of a list, of changes that are advised for one purpose or of mistakes; most components in a line.
 _NUM_LINES, _NUM_COMPONENTS = 8, 5
-# Columns of a mistake's test that do not depend on the measured ranges.
-_SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
 
 @dataclass(frozen=True)
@@ -77,7 +67,7 @@ class SurveyPlan:
         keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
         verdict, reasons: the run's verdict on the scale; "refused" if it will refuse the scale.
         up_stddev_deg: standard deviation of the vertical by the inertial sensor; None without one.
-        by_kind: the same by each kind of ``ALONE`` alone; empty where the plan has one of them.
+        by_kind: the same by each kind of measurement alone, by its name; empty where the plan has one kind.
         warnings: what is odd about the plan, and what a run will leave out.
         mistakes: for each possible mistake the smallest size that would be found (inf: no size that can happen), and
             the largest effect of a mistake that is not found, the largest on the scale first (inf: without limit).
@@ -146,7 +136,7 @@ class SurveyPlan:
         }
         content = {part.name: _finite(getattr(self, part.name)) for part in fields(self) if part.repr}
         del content["advice"]
-        names = ("name", "subject", "unit", *_SIZES)
+        names = ("name", "subject", "unit", *SIZES)
         return content | {
             "by_kind": _finite(alone),
             "mistakes": [{name: each[name] for name in names} for each in content["mistakes"]],
@@ -161,7 +151,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
 
     A survey that a run would refuse has a plan as well, whose advice says what would make it possible.
     """
-    expected = _expect(planned)
+    expected, alone = _expect(planned), planned.by_kind
     verdict, reasons = _verdict(expected)
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
@@ -178,19 +168,19 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         verdict=verdict,
         reasons=reasons,
         up_stddev_deg=None if expected.gravity is None else float(np.rad2deg(expected.gravity.stddev_rad)),
-        by_kind=_by_kind(planned),
-        warnings=(*planned.warnings, *expected.notes),
-        mistakes=_mistakes(expected),
+        by_kind={kind: _expect(each, expected.vision) for kind, each in alone.items()} if len(alone) > 1 else {},
+        warnings=(*planned.warnings, *(() if expected.on_map is None else expected.notes)),
+        mistakes=() if expected.on_map is None else mistakes(expected.on_map),
         advice=advise(expected),
         expected=expected,
     )
 
 
-def _expect(planned: PlannedSurvey) -> Expected:
+def _expect(planned: PlannedSurvey, vision: VisionInformation | None = None) -> Expected:
     try:
-        return expect(planned)
+        return expect(planned, vision=vision)
     except GeometryError as error:
-        return Expected.nothing(planned, str(error))
+        return Expected(replace(planned, photos=None), None, None, (str(error),))
 
 
 def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
@@ -202,18 +192,6 @@ def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
     return verdict.verdict, tuple(verdict.reasons)
 
 
-def _by_kind(planned: PlannedSurvey) -> dict[str, Expected]:
-    nothing = replace(planned, anchors=(), points=(), antenna=None, sensor=None)
-    alone = {
-        "ranges": planned.anchors and replace(nothing, anchors=planned.anchors),
-        "positions": (planned.points or planned.antenna)
-        and replace(nothing, points=planned.points, antenna=planned.antenna),
-        "imu": planned.sensor and replace(nothing, sensor=planned.sensor),
-    }
-    found = {kind: _expect(each) for kind, each in alone.items() if each}
-    return found if len(found) > 1 else {}
-
-
 def _place(expected: Expected) -> PlannedPlace | None:
     of_map, of_keyframes = expected.map_stddevs, expected.keyframe_stddevs_m
     if of_map is None:
@@ -221,9 +199,9 @@ def _place(expected: Expected) -> PlannedPlace | None:
     size_m = float(np.linalg.norm(np.ptp(expected.planned.places_m, axis=0)))
     words, is_wide = place_in_words(of_map, float(of_keyframes.max()), size_m)
     verdict, reasons = "doubtful" if is_wide else "good", [words]
-    if expected.refusal:
+    if expected.on_map is None:
         verdict, reasons = OPEN_PLACE, ["a run will not place the map: it will refuse its scale"]
-    elif open_place := expected.mirror_image():
+    elif open_place := why_place_is_open(expected.on_map):
         verdict, reasons = OPEN_PLACE, [f"a run will give metres, but no place in the site: {open_place}", words]
     x_m, y_m, z_m = of_map[4:].tolist()
     return PlannedPlace(
@@ -235,28 +213,6 @@ def _place(expected: Expected) -> PlannedPlace | None:
         worst_keyframe=int(np.argmax(of_keyframes)),
         worst_keyframe_stddev_m=float(of_keyframes.max()),
     )
-
-
-def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
-    """Return a row for every possible mistake that lasts for the whole survey, without test statistics.
-
-    Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
-    """
-    ranges = expected.ranges
-    if ranges is None:
-        return ()
-    problem = expected_with(ranges_on_map(ranges.posed, ranges.solution, ranges.bending), ranges.learned)
-    hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
-    found = []
-    for test in Factorization(problem).test(hypotheses, seed=0):
-        row = row_of(test)
-        sizes: dict[str, float] = {name: getattr(row, name) for name in _SIZES}
-        if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest
-            share = test.hypothesis.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
-            sizes = {name: share * size for name, size in sizes.items()} | {"smallest_detectable": np.inf}
-        limited: dict[str, Any] = {name: np.inf if size > OPEN else size for name, size in sizes.items()}
-        found.append(replace(row, **limited))
-    return tuple(sorted(found, key=lambda each: -each.effect_on_scale))
 
 
 def size_in_words(size: float, unit: str) -> str:
@@ -299,7 +255,7 @@ def _alone(plan: SurveyPlan) -> Iterator[str]:
         scale = f"scale +-{_rough(100 * NORMAL_95 * alone.uncertainty.empirical, '%')}"
         is_placed = not np.isnan(alone.worst_keyframe_m)
         place = f", least certain keyframe {_half_width_95(alone.worst_keyframe_m)}" if is_placed else ", no place"
-        yield f"{ALONE[kind]} (95 %): {scale}{place}"
+        yield f"{kind} alone (95 %): {scale}{place}"
 
 
 def _budget(plan: SurveyPlan) -> Iterator[str]:

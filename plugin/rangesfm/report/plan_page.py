@@ -14,7 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice
-from rangesfm.planning.survey_plan import ALONE, SurveyPlan, size_in_words
+from rangesfm.planning.survey_plan import SurveyPlan, size_in_words
 from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
@@ -211,7 +211,7 @@ def _anchors(plan: SurveyPlan) -> ReportTable:
 def _by_kind(plan: SurveyPlan) -> ReportTable:
     rows = [
         [
-            ALONE[kind],
+            f"{kind} alone",
             percent(NORMAL_95 * alone.uncertainty.empirical),
             "no place" if math.isnan(alone.worst_keyframe_m) else _half_width_95(alone.worst_keyframe_m, "m"),
         ]

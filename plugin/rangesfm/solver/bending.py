@@ -50,11 +50,14 @@ class Bending:
         parts: components of these errors, in metres.
         formal_m2: (c, c) covariance expected from the photos' residuals; zero if photos were not used.
         shift_m: (c,) change of the functions if the map moves to the minimum of the photos alone.
+        given_sizes: sizes of errors in the map, by name, if none is to be learnt, as where nothing was measured yet;
+            those that are missing are usual ones. None: they are learnt.
     """
 
     parts: tuple[Component, ...]
     formal_m2: Array
     shift_m: Array
+    given_sizes: LearnedSizes | None = None
 
 
 class FrameSteps(NamedTuple):

@@ -132,9 +132,9 @@ def noise_of_sizes(components: Sequence[Component], sizes: Mapping[str, float], 
     return Noise(tuple(covariances), learnt, of_all)
 
 
-def usual_sizes(components: Sequence[Component]) -> dict[str, float]:
-    """Return the size of each component before anything is measured, by name."""
-    return {component.name: component.usual for component in components}
+def usual_sizes(components: Sequence[Component], given: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
+    """Return the size of each component before anything is measured, by name: as given where it is not known anyway."""
+    return {each.name: given.get(each.name, each.usual) if each.spread > 0 else each.usual for each in components}
 
 
 def learnt_sizes(

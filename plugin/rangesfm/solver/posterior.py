@@ -220,7 +220,7 @@ class JointProblem:
         most_bent: float = np.inf,
         near: Mapping[str, float] = MappingProxyType({}),
     ) -> Self:
-        """Return the problem with the sizes of the errors that the observations show.
+        """Return the problem with the sizes of the errors that the observations show, if they are not given.
 
         Args:
             mistakes: (c, m) effects of each on the observations, or (c + r, m) also on the priors. They explain what
@@ -229,6 +229,8 @@ class JointProblem:
                 errs in measurements, and in the map.
             near: sizes in nearly the same problem to start from, by name, which takes half the time.
         """
+        if self.bending.given_sizes is not None:
+            return self
         used, linear, widened = self.is_used, self.linear, self.linear.with_more(mistakes)
         # Residuals are taken where those of the priors are smallest.
         back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=UNDETERMINED)[0]
@@ -289,7 +291,7 @@ class JointProblem:
 
 
 def joined(observations: Sequence[Observations], bending: MapBending) -> JointProblem:
-    """Join observations of all kinds on one map, with the usual sizes of their errors.
+    """Join observations of all kinds on one map, with the given or usual sizes of their errors.
 
     Args:
         bending: of the map.
@@ -315,7 +317,7 @@ def joined(observations: Sequence[Observations], bending: MapBending) -> JointPr
         linear,
         rows,
         components,
-        usual_sizes(components),
+        usual_sizes(components, bent.given_sizes or {}),
         bent,
         np.asarray(block_diag(*(each.alone_m2 for each in observations))),
         np.concatenate([each.is_used for each in observations]),

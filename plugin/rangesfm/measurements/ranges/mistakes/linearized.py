@@ -11,14 +11,13 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.ranges.errors.components import DRIFT_S, WANDERING
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.noise import Component, usual_sizes
+from rangesfm.solver.noise import usual_sizes
 from rangesfm.solver.posterior import JointProblem, joined
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
@@ -152,17 +151,6 @@ def linearized(on_map: RangesOnMap) -> Linearized:
     weights = (agrees & _can_be(on_map)).astype(np.float64)
     noise_of_anchor = noisiness(index[order], off_m, on_map.problem.num_anchors)
     return _with_usual_errors(on_map, on_map.bins(weights, noise_of_anchor, _MAX_NUM_BINS), scatter_m)
-
-
-def expected_with(on_map: RangesOnMap, learned: LearnedErrors) -> Linearized:
-    """Linearise ranges without noise, of a map that is not bent, with the errors to expect."""
-    problem, errors = (
-        _with_usual_errors(on_map, learned.bins, 0.0),
-        zip(learned.names, learned.covariances_m2, strict=True),
-    )
-    return replace(
-        problem, components=tuple(Component(*each) for each in errors), sizes=dict.fromkeys(learned.names, 1.0)
-    )
 
 
 def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:

@@ -16,7 +16,7 @@ from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
 from rangesfm.measurements.ranges.scale.solution import (
     Solution,
     solution_from,
@@ -41,23 +41,31 @@ class RangesToSolve(Located):
 
     kind = RANGES
 
+    def posed(self, others: Sequence[KindOnMap], *, place_is_open: bool = False) -> ScaleProblem:
+        """Return their problem beside the other kinds; argument and errors as of ``scale_problem``."""
+        distances = with_lengths(self.given.distances, others)
+        given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
+        placement = placement_by(others, first_camera_from(given.trajectory))
+        return scale_problem(given, placement, place_is_open=place_is_open)
+
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges at the best solution of their problem.
 
         Raises:
             InputError: an anchor of the log is not given. GeometryError: the scale is not determined.
         """
-        path, distances = self.given.trajectory, with_lengths(self.given.distances, others)
-        given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
-        placement = placement_by(others, first_camera_from(path))
-        problem, notes = scale_problem(given, placement), tuple[str, ...]()
+        problem, notes = self.posed(others), tuple[str, ...]()
         solution = solve_scale(problem)
         if solution.why_open:
             notes = (f"the map gets metres, but no place in the site: {solution.why_open}",)
-            problem = scale_problem(given, placement, place_is_open=True)
+            problem = self.posed(others, place_is_open=True)
             solution = solution_from(problem, solution.fit.state.in_frame_of_model())
-        told = RangeEstimate.begun(given.observations, given.range_model)
-        return RangeScale(problem, solution, path, 1.0, self.bending, told, notes)
+        return self.solved(problem, solution, notes)
+
+    def solved(self, problem: ScaleProblem, solution: Solution, notes: tuple[str, ...] = ()) -> RangeScale:
+        """Return the ranges at a solution of their problem."""
+        told = RangeEstimate.begun(self.given.observations, self.given.range_model)
+        return RangeScale(problem, solution, self.given.trajectory, 1.0, self.bending, told, notes)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,155 @@
+"""Ranges of a planned survey on its true map, as they may turn out, and the mistakes that would be found in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
+from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, row_of
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
+from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
+from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
+from rangesfm.options import LENGTH_M
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.mistakes import MistakeTest
+from rangesfm.solver.posterior import joined
+from rangesfm.util.geometry.similarity import IDENTITY
+from rangesfm.util.geometry.trajectory import first_camera_from
+
+OPEN = 1e3
+"""Standard deviation, in metres or radians, from which on a number counts as not determined."""
+SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
+"""Columns of a mistake's test that do not depend on the measured ranges."""
+# Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
+# plane. In a plan it may be, and the linearized problem would then miss what is not determined.
+_OFF_LINE_M = (0.07, 0.07, 0.1)
+
+
+def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequence[KindOnMap]) -> RangeScale:
+    """Return the ranges of a plan on its true map, where a run would solve their problem beside the other kinds.
+
+    Raises:
+        GeometryError: the run will refuse them.
+    """
+    path, first_camera = planned.trajectory, first_camera_from(planned.trajectory)
+    into = first_camera if planned.anchor_frame == "first_camera" else IDENTITY
+    told = [replace(a, position_m=into.apply(at)) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)]
+    given = RangesOnPath(_observations(planned), path, told, planned.anchor_frame, planned.range_model)
+    ranges = RangesToSolve(given, bending)
+    posed = ranges.posed(others)
+    state = true_state(planned, posed)
+    tags_m, placing_m = antenna_positions(posed.ranges, state.metric_from_model), posed.placing_stddev_m(1.0)
+    noise_m = planned.given_sizes.get("white", START_STDDEV_M)
+    stddev_m = np.sqrt(noise_m**2 + placing_m**2 + posed.errors.shared_m**2)
+    errors = replace(posed.errors.at(tags_m, placing_m), stddev_m=stddev_m)
+    problem = weighted(posed.ranges, errors)
+    fit = fit_at(problem, state, np.full(len(posed.rows), float(planned.num_alike)))
+    return ranges.solved(posed, Solution(problem, fit, errors, START_STDDEV_M))
+
+
+def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
+    """Return the true state in the frame of a problem of the ranges of a plan."""
+    ids, first_camera = [anchor.anchor_id for anchor in planned.anchors], first_camera_from(planned.trajectory)
+    places_m = _standing_m(planned)[[ids.index(anchor_id) for anchor_id in posed.observations.log.anchor_ids]]
+    biases_m = posed.ranges.bias_mean_m.copy()
+    if posed.frame == "site":
+        return RangeState(first_camera.inverse(), places_m, biases_m)
+    return RangeState(IDENTITY, first_camera.apply(places_m), biases_m)
+
+
+def _standing_m(planned: PlannedSurvey) -> Array:
+    """Return the positions of the anchors in the computation (m, 3)."""
+    return planned.anchors_m + _OFF_LINE_M if planned.anchor_frame == "unknown" else planned.anchors_m
+
+
+def _observations(planned: PlannedSurvey) -> RangeObservations:
+    """Simulate ranges without errors on the path; if there are many, each stands for several."""
+    num_anchors, path = len(planned.anchors), planned.trajectory
+    turn = np.arange(planned.num_ranges // planned.num_alike)
+    first_s = 0.0 if path.timestamps_s is None else float(path.timestamps_s[0])
+    times = first_s + (turn + 0.5) * planned.num_alike / (planned.rate_hz * num_anchors)
+    ids = [anchor.anchor_id for anchor in planned.anchors]
+    log = RangeLog.from_arrays([ids[k] for k in turn % num_anchors], np.ones(len(turn)), timestamp_s=times)
+    places = associate(log, path, planned.tag_in_cam_m)
+    at = _standing_m(planned)[[ids.index(anchor_id) for anchor_id in log.anchor_ids]]
+    distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
+    curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
+    # A range without a position on the path is not used; it only needs a valid number.
+    measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
+    return replace(places, log=measured)
+
+
+def turned_out(on_map: JointMap, seed: int) -> RangeObservations:
+    """Return the planned ranges on a map with errors drawn from those to expect."""
+    ranges = find_kind(on_map.kinds, RangeScale)
+    assert ranges is not None, "a plan with ranges"
+    posed, learned, rng = ranges.posed, ranges.learnt(on_map), np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(learned.without("white").covariance_m2)
+    of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+    white_m = learned.stddev_of_component["white"] / np.sqrt(ranges.solution.fit.weights)
+    range_m = posed.observations.log.range_m.copy()
+    range_m[posed.rows] += of_bins[learned.of_range] + white_m * rng.standard_normal(len(learned.of_range))
+    log = replace(posed.observations.log, range_m=np.maximum(range_m, LENGTH_M.least))
+    return replace(posed.observations, log=log)
+
+
+def why_place_is_open(on_map: JointMap) -> str:
+    """Return why the run will leave the place of a planned map open; empty if it will not.
+
+    It is open if the map's mirror image in the anchors' plane fits ranges as they may turn out.
+    """
+    ranges = find_kind(on_map.kinds, RangeScale)
+    if ranges is None or not ranges.places_map or ranges.posed.ranges.placement is not None:
+        return ""
+    state = ranges.solution.fit.state
+    mirrored = mirrored_map(ranges.posed.ranges, state)
+    if mirrored is None:
+        return ""
+    try:
+        # For a path in that plane the height is not determined, and the solver divides 0 by 0.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            posed = scale_problem(replace(ranges.posed.given, observations=turned_out(on_map, 0)))
+            return refuse_ambiguity(solution_from(posed, state), [mirrored], None)
+    except GeometryError as error:
+        return str(error)
+
+
+def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
+    """Return a row for every possible mistake in planned ranges that lasts for the whole survey, without statistics.
+
+    Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
+    """
+    ranges = find_kind(on_map.kinds, RangeScale)
+    if ranges is None:
+        return ()
+    here, bins = ranges_on_map(ranges.posed, ranges.solution, ranges.bending), ranges.learnt(on_map).bins
+    joint = joined([in_bins(here, bins, START_STDDEV_M, {}, np.zeros(len(bins)))], here.bending)
+    problem = Linearized(**vars(joint), on_map=here, bins=bins, scatter_m=0.0)
+    found = []
+    for test in Factorization(problem).estimates([each for of_kind in STANDING for each in of_kind(problem)]):
+        row = row_of(test)
+        sizes: dict[str, float] = {name: getattr(row, name) for name in SIZES}
+        if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest
+            share = test.hypothesis.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
+            sizes = {name: share * size for name, size in sizes.items()} | {"smallest_detectable": np.inf}
+        limited: dict[str, Any] = {name: np.inf if size > OPEN else size for name, size in sizes.items()}
+        found.append(replace(row, **limited))
+    return tuple(sorted(found, key=lambda each: -each.effect_on_scale))
