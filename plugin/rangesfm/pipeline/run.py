@@ -180,7 +180,7 @@ def _with_clocks(run: SurveyRun, path: Trajectory) -> SurveyRun:
         run.journal.warn(*found.mistakes)
         half_s = NORMAL_95 * found.time_offset_stddev_s
         offset = f"{found.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
-        run.journal.note(f"time offset of the inertial sensor: {offset}, by {found.num_turns} turns of the photos")
+        run.journal.note(f"time offset of the inertial sensor: {offset}, by {len(found.turns)} turns of the photos")
     inputs, doubts = replace(run.inputs, positions=positions, imu=imu), tuple(positions.doubts_of_clock)
     return replace(run, inputs=inputs, doubts=doubts)
 

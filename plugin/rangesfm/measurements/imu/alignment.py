@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask, rms
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.imu.log import ImuLog
-from rangesfm.measurements.imu.turns import GyroTurns
 from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.rotations import cross_matrices
@@ -59,40 +58,6 @@ _CLEARLY = 1.25
 
 
 @dataclass(frozen=True)
-class ImuAlignment:
-    """How a sensor's log belongs to photos.
-
-    Attributes:
-        log: with rates in rad/s, also where the file has them in degrees.
-        time_offset_s: image time = time of the log + offset.
-        time_offset_stddev_s: its standard deviation; that of the search, or 0 where it is taken as given.
-        cam_from_imu: (3, 3) rotation.
-        rotation_covariance: (3, 3) of a small turn about the camera's axes, rad^2.
-        gyro_bias_rad_s: (3,) mean bias. gyro_bias_covariance: (3, 3).
-        residual_rad: root mean square of a turn's errors, each of three axes, in the bulk of the turns.
-        num_turns: turns between neighbouring photos that were used.
-        mistakes: what is wrong with the log or what was given with it, and what to do, one line each.
-    """
-
-    log: ImuLog
-    time_offset_s: float
-    time_offset_stddev_s: float
-    cam_from_imu: Array
-    rotation_covariance: Array
-    gyro_bias_rad_s: Array
-    gyro_bias_covariance: Array
-    residual_rad: float
-    num_turns: int
-    mistakes: tuple[str, ...] = ()
-
-    @property
-    def rotation_imu_to_cam_xyzw(self) -> tuple[float, float, float, float]:
-        """The rotation as a unit quaternion with w of no negative sign."""
-        x, y, z, w = Rotation.from_matrix(self.cam_from_imu).as_quat(canonical=True).tolist()
-        return x, y, z, w
-
-
-@dataclass(frozen=True)
 class _PhotoTurns:
     """n turns between neighbouring photos.
 
@@ -100,31 +65,64 @@ class _PhotoTurns:
         from_s, to_s: (n,) times of both photos.
         vectors: (n, 3) rotation vectors in the camera's frame.
         first: (n,) index of the first photo of each.
+        resolution_s: of the times.
     """
 
     from_s: Array
     to_s: Array
     vectors: Array
     first: Indices
+    resolution_s: float
 
     def take(self, rows: Mask) -> _PhotoTurns:
-        return _PhotoTurns(self.from_s[rows], self.to_s[rows], self.vectors[rows], self.first[rows])
+        return replace(
+            self,
+            from_s=self.from_s[rows],
+            to_s=self.to_s[rows],
+            vectors=self.vectors[rows],
+            first=self.first[rows],
+        )
 
     def __len__(self) -> int:
         return len(self.from_s)
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """A local optimum: offset, rotation and bias, with their covariance (7, 7) in this order and the residuals."""
+class ImuAlignment:
+    """How a sensor's log belongs to photos.
 
-    offset_s: float
-    cam_from_imu: Array
-    bias_rad_s: Array
-    covariance: Array
-    stddev_rad: float
+    Attributes:
+        log: with rates in rad/s, also where the file has them in degrees.
+        turns: between neighbouring photos, those that were used.
+        time_offset_s: image time = time of the log + offset.
+        cam_from_imu: (3, 3) rotation.
+        gyro_bias_rad_s: (3,) mean bias.
+        residual_rad: standard deviation of a turn's errors, each of three axes, in the bulk of the turns.
+        covariance: (7, 7) of the offset, of a small turn about the camera's axes (rad), and of the bias; 0 for what was
+            taken as given.
+        is_mirrored: whether the turns are those of the photos in a mirror.
+        mistakes: what is wrong with the log or what was given with it, and what to do, one line each.
+    """
+
+    log: ImuLog
     turns: _PhotoTurns
+    time_offset_s: float
+    cam_from_imu: Array
+    gyro_bias_rad_s: Array
+    residual_rad: float
+    covariance: Array
     is_mirrored: bool = False
+    mistakes: tuple[str, ...] = ()
+
+    @property
+    def time_offset_stddev_s(self) -> float:
+        """Standard deviation of the offset, with that of the photos' times as they are written."""
+        return float(np.hypot(np.sqrt(self.covariance[0, 0]), self.turns.resolution_s / np.sqrt(12)))
+
+    @property
+    def rotation_covariance(self) -> Array:
+        """(3, 3) of a small turn about the camera's axes, rad^2."""
+        return self.covariance[1:4, 1:4]
 
     @property
     def is_determined(self) -> bool:
@@ -133,7 +131,8 @@ class _Fit:
 
     @property
     def unexplained(self) -> float:
-        return 3 * self.stddev_rad**2 / max(float(np.mean(np.sum(self.turns.vectors**2, axis=1))), 1e-300)
+        """Share of the turns' squares that is left."""
+        return 3 * self.residual_rad**2 / max(float(np.mean(np.sum(self.turns.vectors**2, axis=1))), 1e-300)
 
 
 def align_imu(
@@ -152,11 +151,9 @@ def align_imu(
         GeometryError: the turns do not determine the alignment, or they are not of the same camera.
     """
     turns = _turns_of(path, log)
-    rates = log.gyro_rad_s
-    fits = [_best(log, rates / factor, turns) for factor in _possible_factors(log, turns)]
-    k = min(range(len(fits)), key=lambda k: fits[k][0].unexplained)
-    (fit, rival), factor = fits[k], _possible_factors(log, turns)[k]
-    gyro = _gyro(log, rates / factor)
+    factors = _possible_factors(log, turns)
+    fits = [_best(replace(log, gyro_rad_s=log.gyro_rad_s / factor), turns) for factor in factors]
+    (fit, rival), factor = min(zip(fits, factors, strict=True), key=lambda each: each[0][0].unexplained)
     mistakes = []
     if fit.is_mirrored:
         raise GeometryError(
@@ -166,12 +163,12 @@ def align_imu(
     if fit.unexplained > _MOST_UNEXPLAINED:
         raise GeometryError(
             f"{log.name}: at no time offset do the turns of the gyroscope fit those of the photos (the best leaves "
-            f"{np.degrees(fit.stddev_rad):.1f} deg): is the log of this survey, and the sensor fixed to the camera?"
+            f"{np.degrees(fit.residual_rad):.1f} deg): is the log of this survey, and the sensor fixed to the camera?"
         )
     if rival is not None:
         raise GeometryError(
-            f"{log.name}: the turns fit the photos' at time offsets of {fit.offset_s:+.2f} s and of "
-            f"{rival.offset_s:+.2f} s: turn the camera more often and less evenly, or give time_offset"
+            f"{log.name}: the turns fit the photos' at time offsets of {fit.time_offset_s:+.2f} s and of "
+            f"{rival.time_offset_s:+.2f} s: turn the camera more often and less evenly, or give time_offset"
         )
     if factor != 1.0:
         unit = "degrees a second" if factor > 1 else "180 / pi times too small"
@@ -180,7 +177,7 @@ def align_imu(
             "name its columns gyro_x_deg_s, or write them in rad/s"
         )
     if not fit.is_determined and cam_from_imu is not None:
-        fit = _refined(gyro, turns, replace(fit, cam_from_imu=cam_from_imu), is_rotation_held=True) or fit
+        fit = _refined(turns, replace(fit, cam_from_imu=cam_from_imu), is_rotation_held=True) or fit
     if not fit.is_determined:
         offset_stddev_s, turn = np.sqrt(fit.covariance[0, 0]), np.degrees(np.sqrt(np.diag(fit.covariance)[1:4].max()))
         raise GeometryError(
@@ -188,22 +185,11 @@ def align_imu(
             f"+-{offset_stddev_s:.2g} s, rotation +-{turn:.2g} deg): turn the camera about two axes, or give "
             "rotation_imu_to_cam_xyzw"
         )
-    mistakes += _wrong_rotation(log, fit, cam_from_imu)
-    mistakes += _wrong_offset(log, fit, time_offset_s, path.time_resolution_s)
-    _require_fixed(log, gyro, fit, turns)
-    _require_same_axes(log, gyro, fit, path)
-    return ImuAlignment(
-        replace(log, gyro_rad_s=rates / factor),
-        fit.offset_s,
-        float(np.hypot(np.sqrt(fit.covariance[0, 0]), path.time_resolution_s / np.sqrt(12))),
-        fit.cam_from_imu,
-        fit.covariance[1:4, 1:4],
-        fit.bias_rad_s,
-        fit.covariance[4:, 4:],
-        fit.stddev_rad,
-        len(fit.turns),
-        tuple(mistakes),
-    )
+    mistakes += _wrong_rotation(fit, cam_from_imu)
+    mistakes += _wrong_offset(fit, time_offset_s)
+    _require_fixed(fit, turns)
+    _require_same_axes(fit, path)
+    return replace(fit, mistakes=tuple(mistakes))
 
 
 def _turns_of(path: Trajectory, log: ImuLog) -> _PhotoTurns:
@@ -217,11 +203,8 @@ def _turns_of(path: Trajectory, log: ImuLog) -> _PhotoTurns:
             f"sits, expected {MIN_NUM_TURNS} or more"
         )
     turned = np.swapaxes(path.world_from_cam[first], 1, 2) @ path.world_from_cam[first + 1]
-    return _PhotoTurns(times_s[first], times_s[first + 1], Rotation.from_matrix(turned).as_rotvec(), first)
-
-
-def _gyro(log: ImuLog, rates: Array) -> GyroTurns:
-    return GyroTurns(log.timestamp_s, rates, log.longest_gap_s)
+    vectors = Rotation.from_matrix(turned).as_rotvec()
+    return _PhotoTurns(times_s[first], times_s[first + 1], vectors, first, path.time_resolution_s)
 
 
 def _possible_factors(log: ImuLog, turns: _PhotoTurns) -> tuple[float, ...]:
@@ -235,17 +218,17 @@ def _possible_factors(log: ImuLog, turns: _PhotoTurns) -> tuple[float, ...]:
     return (1.0, _DEGREES) if ratio > 7.0 else (1.0, 1 / _DEGREES) if ratio < 1 / 7.0 else (1.0,)
 
 
-def _best(log: ImuLog, rates: Array, turns: _PhotoTurns) -> tuple[_Fit, _Fit | None]:
+def _best(log: ImuLog, turns: _PhotoTurns) -> tuple[ImuAlignment, ImuAlignment | None]:
     """Return the best fit over all offsets, and another that is about as likely; None if there is none.
 
     Raises:
         InputError: log and photos do not overlap at any offset.
     """
-    gyro, found = _gyro(log, rates), list[_Fit]()
-    for offset_s in _candidates(gyro, turns, log):
-        start = _started(gyro, turns, offset_s)
-        fit = None if start is None else _refined(gyro, turns, start)
-        if fit is not None and all(abs(fit.offset_s - one.offset_s) > _APART_S for one in found):
+    found = list[ImuAlignment]()
+    for offset_s in _candidates(log, turns):
+        start = _started(log, turns, offset_s)
+        fit = None if start is None else _refined(turns, start)
+        if fit is not None and all(abs(fit.time_offset_s - one.time_offset_s) > _APART_S for one in found):
             found.append(fit)
     if not found:
         raise GeometryError(f"{log.name}: at no time offset do the turns of the gyroscope fit those of the photos")
@@ -254,22 +237,22 @@ def _best(log: ImuLog, rates: Array, turns: _PhotoTurns) -> tuple[_Fit, _Fit | N
     return best, rivals[0] if rivals else None
 
 
-def _badness(fit: _Fit) -> float:
+def _badness(fit: ImuAlignment) -> float:
     """Return minus the logarithm of the likelihood of a fit, whatever the noise, for the turns of a whole survey."""
     return 1.5 * len(fit.turns) * float(np.log(max(fit.unexplained, 1e-12)))
 
 
-def _candidates(gyro: GyroTurns, turns: _PhotoTurns, log: ImuLog) -> list[float]:
+def _candidates(log: ImuLog, turns: _PhotoTurns) -> list[float]:
     """Return the offsets at which the angles of the turns agree best, all apart."""
-    least_s, most_s = turns.from_s[0] - gyro.times_s[-1], turns.to_s[-1] - gyro.times_s[0]
+    least_s, most_s = turns.from_s[0] - log.timestamp_s[-1], turns.to_s[-1] - log.timestamp_s[0]
     offsets_s = np.arange(least_s, most_s, _STEP_S)
     angles = np.linalg.norm(turns.vectors, axis=1)
     need = max(MIN_NUM_TURNS, _LEAST_SHARE * len(turns))
     cost = np.full(len(offsets_s), np.inf)
     for some in np.array_split(np.arange(len(offsets_s)), max(1, len(offsets_s) * len(turns) // 1_000_000)):
         from_s, to_s = (times - offsets_s[some, None] for times in (turns.from_s, turns.to_s))
-        known = gyro.know(from_s, to_s)
-        ends = (gyro.nearest_quaternions(times) for times in (from_s, to_s))
+        known = log.knows(from_s, to_s)
+        ends = (log.nearest_quaternions(times) for times in (from_s, to_s))
         cosines = np.abs(np.einsum("otq,otq->ot", *ends))
         of_sensor = 2 * np.arccos(np.minimum(cosines, 1.0))
         num = known.sum(axis=1)
@@ -278,9 +261,11 @@ def _candidates(gyro: GyroTurns, turns: _PhotoTurns, log: ImuLog) -> list[float]
         scale = np.where(known, angles, 0.0).sum(axis=1)
         cost[some] = np.where(num >= need, errors / np.maximum(scale, 1e-300), np.inf)
     if not np.isfinite(cost).any():
+        of_log = span_text(log.timestamp_s[0], log.timestamp_s[-1])
+        of_photos = span_text(turns.from_s[0], turns.to_s[-1])
         raise InputError(
-            f"the sensor's log ({span_text(gyro.times_s[0], gyro.times_s[-1])}) has no stretch without gaps as long as "
-            f"{need:.0f} turns of the photos ({span_text(turns.from_s[0], turns.to_s[-1])})",
+            f"the sensor's log ({of_log}) has no stretch without gaps as long as {need:.0f} turns of the photos "
+            f"({of_photos})",
             log.path or None,
         )
     chosen = list[float]()
@@ -292,12 +277,12 @@ def _candidates(gyro: GyroTurns, turns: _PhotoTurns, log: ImuLog) -> list[float]
     return chosen
 
 
-def _started(gyro: GyroTurns, turns: _PhotoTurns, offset_s: float) -> _Fit | None:
+def _started(log: ImuLog, turns: _PhotoTurns, offset_s: float) -> ImuAlignment | None:
     """Return the best rotation at an offset, mirrored if that fits better; None if no turns are in the log."""
-    turns = turns.take(gyro.know(turns.from_s - offset_s, turns.to_s - offset_s))
+    turns = turns.take(log.knows(turns.from_s - offset_s, turns.to_s - offset_s))
     if len(turns) < MIN_NUM_TURNS:
         return None
-    of_sensor = gyro.between(turns.from_s - offset_s, turns.to_s - offset_s)
+    of_sensor = log.turns_between(turns.from_s - offset_s, turns.to_s - offset_s)
     left, _, right = np.linalg.svd(turns.vectors.T @ of_sensor)
     proper, mirrored = (left @ np.diag([1.0, 1.0, sign * np.linalg.det(left @ right)]) @ right for sign in (1.0, -1.0))
     misses = [np.median(np.linalg.norm(turns.vectors - of_sensor @ one.T, axis=1)) for one in (proper, mirrored)]
@@ -305,28 +290,29 @@ def _started(gyro: GyroTurns, turns: _PhotoTurns, offset_s: float) -> _Fit | Non
     is_mirrored = bool(misses[1] < 0.5 * misses[0])
     start = mirrored if is_mirrored else proper
     stddev = float(min(misses)) / _MEDIAN_OF_CHI3
-    return _Fit(offset_s, start, np.zeros(3), np.eye(7), max(stddev, 1e-9), turns, is_mirrored)
+    return ImuAlignment(log, turns, offset_s, start, np.zeros(3), max(stddev, 1e-9), np.eye(7), is_mirrored)
 
 
-def _refined(gyro: GyroTurns, turns: _PhotoTurns, start: _Fit, *, is_rotation_held: bool = False) -> _Fit | None:
+def _refined(turns: _PhotoTurns, start: ImuAlignment, *, is_rotation_held: bool = False) -> ImuAlignment | None:
     """Return the robust least-squares solution near a start; None if it leaves the log."""
-    offset_s, rotation, bias, stddev = start.offset_s, start.cam_from_imu, start.bias_rad_s, start.stddev_rad
+    log, offset_s, rotation, bias = start.log, start.time_offset_s, start.cam_from_imu, start.gyro_bias_rad_s
+    stddev = start.residual_rad
     is_free = np.array([True, *3 * [not is_rotation_held], True, True, True])
     used, covariance = turns, np.eye(7)
     for _ in range(_NUM_ITERATIONS):
-        used = turns.take(gyro.know(turns.from_s - offset_s, turns.to_s - offset_s))
+        used = turns.take(log.knows(turns.from_s - offset_s, turns.to_s - offset_s))
         if len(used) < MIN_NUM_TURNS:
             return None
         from_s, to_s = used.from_s - offset_s, used.to_s - offset_s
-        by_bias = gyro.by_bias(from_s, to_s)
-        of_sensor = gyro.between(from_s, to_s) + by_bias @ bias
+        by_bias = log.turns_by_bias(from_s, to_s)
+        of_sensor = log.turns_between(from_s, to_s) + by_bias @ bias
         predicted = of_sensor @ rotation.T
         residual = used.vectors - predicted
         lengths = np.linalg.norm(residual, axis=1)
         stddev = max(float(np.median(lengths)) / _MEDIAN_OF_CHI3, 1e-9)
         weights = np.repeat(CAUCHY.weights(lengths / (stddev * _MEDIAN_OF_CHI3)), 3)
         slopes = np.zeros((len(used), 3, 7))
-        slopes[:, :, 0] = _by_offset(gyro, from_s, to_s) @ rotation.T
+        slopes[:, :, 0] = _by_offset(log, from_s, to_s) @ rotation.T
         slopes[:, :, 1:4] = -cross_matrices(predicted)
         slopes[:, :, 4:] = rotation @ by_bias
         columns = slopes.reshape(-1, 7)
@@ -346,12 +332,12 @@ def _refined(gyro: GyroTurns, turns: _PhotoTurns, start: _Fit, *, is_rotation_he
             break
     return replace(
         start,
-        offset_s=float(offset_s),
-        cam_from_imu=rotation,
-        bias_rad_s=bias,
-        covariance=covariance,
-        stddev_rad=stddev,
         turns=used,
+        time_offset_s=float(offset_s),
+        cam_from_imu=rotation,
+        gyro_bias_rad_s=bias,
+        residual_rad=stddev,
+        covariance=covariance,
     )
 
 
@@ -363,18 +349,19 @@ def _covariance(normal: Array, stddev: float, is_free: Mask) -> Array:
     return np.asarray(covariance)
 
 
-def _by_offset(gyro: GyroTurns, from_s: Array, to_s: Array) -> Array:
+def _by_offset(log: ImuLog, from_s: Array, to_s: Array) -> Array:
     """Return the change (n, 3) of the turns by the offset, by central differences over a photo's exposure."""
     half_s = 0.005
-    low, high = (gyro.between(from_s - later, to_s - later) for later in (-half_s, half_s))
+    low, high = (log.turns_between(from_s - later, to_s - later) for later in (-half_s, half_s))
     return np.asarray((high - low) / (2 * half_s))
 
 
-def _wrong_rotation(log: ImuLog, fit: _Fit, given: Array | None) -> Iterator[str]:
-    if given is None or not fit.covariance[1:4, 1:4].any():
+def _wrong_rotation(fit: ImuAlignment, given: Array | None) -> Iterator[str]:
+    if given is None or not fit.rotation_covariance.any():
         return
+    log = fit.log
     turn = Rotation.from_matrix(given @ fit.cam_from_imu.T).as_rotvec()
-    squared = turn @ np.linalg.solve(fit.covariance[1:4, 1:4], turn)
+    squared = turn @ np.linalg.solve(fit.rotation_covariance, turn)
     if squared > _FAR_OFF_SQUARED_3 and np.linalg.norm(turn) > _MOUNTED:
         inverse = np.linalg.norm(Rotation.from_matrix(given.T @ fit.cam_from_imu.T).as_rotvec()) < _MOUNTED
         why = "it is the rotation from camera to sensor: give its inverse" if inverse else "leave it out"
@@ -385,28 +372,29 @@ def _wrong_rotation(log: ImuLog, fit: _Fit, given: Array | None) -> Iterator[str
         )
 
 
-def _wrong_offset(log: ImuLog, fit: _Fit, given_s: float | None, resolution_s: float) -> Iterator[str]:
+def _wrong_offset(fit: ImuAlignment, given_s: float | None) -> Iterator[str]:
     if given_s is None:
         return
+    log = fit.log
     # Nobody knows an offset better than to a sample of the log.
-    stddev_s, other_s = float(np.sqrt(fit.covariance[0, 0])), max(log.step_s, resolution_s)
-    if abs(given_s - fit.offset_s) > _FAR_OFF_1 * stddev_s + other_s:
-        sign = "; it has the other sign" if abs(given_s + fit.offset_s) < _FAR_OFF_1 * stddev_s + other_s else ""
+    stddev_s, other_s = float(np.sqrt(fit.covariance[0, 0])), max(log.step_s, fit.turns.resolution_s)
+    if abs(given_s - fit.time_offset_s) > _FAR_OFF_1 * stddev_s + other_s:
+        sign = "; it has the other sign" if abs(given_s + fit.time_offset_s) < _FAR_OFF_1 * stddev_s + other_s else ""
         yield (
             f"{log.name}: the given time_offset of {given_s:+.3f} s is not the one that the turns of the photos show, "
-            f"{fit.offset_s:+.3f} +- {1.96 * stddev_s:.3f} s (95 %), which is taken{sign}"
+            f"{fit.time_offset_s:+.3f} +- {1.96 * stddev_s:.3f} s (95 %), which is taken{sign}"
         )
 
 
-def _require_fixed(log: ImuLog, gyro: GyroTurns, fit: _Fit, turns: _PhotoTurns) -> None:
+def _require_fixed(fit: ImuAlignment, turns: _PhotoTurns) -> None:
     """Raise GeometryError if the sensor sits otherwise in the second half of the photos than in the first."""
-    is_first = np.arange(len(turns)) < len(turns) // 2
-    halves = [_refined(gyro, turns.take(part), fit) for part in (is_first, ~is_first)]
+    log, is_first = fit.log, np.arange(len(turns)) < len(turns) // 2
+    halves = [_refined(turns.take(part), fit) for part in (is_first, ~is_first)]
     found = [half for half in halves if half is not None and half.is_determined]
     if len(found) < 2:
         return
     turn = Rotation.from_matrix(found[1].cam_from_imu @ found[0].cam_from_imu.T).as_rotvec()
-    covariance = sum(half.covariance[1:4, 1:4] for half in found)
+    covariance = sum(half.rotation_covariance for half in found)
     angle = float(np.linalg.norm(turn))
     if angle > _SLIPPED and turn @ np.linalg.solve(covariance, turn) > _FAR_OFF_SQUARED_3:
         raise GeometryError(
@@ -415,9 +403,9 @@ def _require_fixed(log: ImuLog, gyro: GyroTurns, fit: _Fit, turns: _PhotoTurns) 
         )
 
 
-def _require_same_axes(log: ImuLog, gyro: GyroTurns, fit: _Fit, path: Trajectory) -> None:
+def _require_same_axes(fit: ImuAlignment, path: Trajectory) -> None:
     """Raise GeometryError if gravity does not stay where it is, or only with other axes of the accelerometer."""
-    means = _turned_means(log, gyro, fit, path)
+    log, means = fit.log, _turned_means(fit, path)
     others = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in _SIGNS]
     # All signs reversed does not move gravity either: of both, the right-handed axes.
     scatters = [_scatter(means, other * np.linalg.det(other)) for other in others]
@@ -445,19 +433,19 @@ def _name_of_axis(row: Array) -> str:
     return f"{'-' if row[k] < 0 else ''}{'xyz'[k]}"
 
 
-def _turned_means(log: ImuLog, gyro: GyroTurns, fit: _Fit, path: Trajectory) -> Array:
+def _turned_means(fit: ImuAlignment, path: Trajectory) -> Array:
     """Return for each turn the matrix (n, 3, 9) that gives the mean acceleration in the photos' world by axes.
 
     The acceleration with other axes M (3, 3) is M f; its mean is linear in M.
     """
-    times_s, turns = log.timestamp_s, fit.turns
-    starts = np.searchsorted(times_s, turns.from_s - fit.offset_s)
-    ends = np.searchsorted(times_s, turns.to_s - fit.offset_s)
-    orientation = gyro.orientation(times_s).as_matrix()
+    log, times_s, turns = fit.log, fit.log.timestamp_s, fit.turns
+    starts = np.searchsorted(times_s, turns.from_s - fit.time_offset_s)
+    ends = np.searchsorted(times_s, turns.to_s - fit.time_offset_s)
+    orientation = log.orientation(times_s).as_matrix()
     products = np.einsum("kij,kl->kijl", orientation, log.accel_m_s2).reshape(len(times_s), -1)
     summed = np.concatenate([np.zeros((1, 27)), np.cumsum(products, axis=0)])
     means = (summed[ends] - summed[starts]) / np.maximum(ends - starts, 1)[:, None]
-    at_photo = gyro.orientation(turns.from_s - fit.offset_s).as_matrix()
+    at_photo = log.orientation(turns.from_s - fit.time_offset_s).as_matrix()
     world_from_first = path.world_from_cam[turns.first] @ fit.cam_from_imu @ np.swapaxes(at_photo, 1, 2)
     return np.asarray((world_from_first @ means.reshape(-1, 3, 9))[ends > starts])
 

@@ -1,13 +1,16 @@
-"""ImuLog: what an inertial sensor measured, as checked arrays, and the noise of its two sensors."""
+"""ImuLog: what an inertial sensor measured and how it turned, as checked arrays, and the noise of its two sensors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.util.geometry.rotations import left_jacobians
 
 # Times of arrival are those of an even clock and delays if in each stretch of so many samples ...
 _NUM_IN_STRETCH = 1000
@@ -122,3 +125,76 @@ class ImuLog:
         Hands and drones move with frequencies of some hertz: over a tenth of a second they turn evenly.
         """
         return max(0.1, 3 * self.step_s)
+
+    @cached_property
+    def _steps(self) -> Array:
+        """Rotation vectors (k - 1, 3) from each sample to the next, in the sensor's frame."""
+        return 0.5 * (self.gyro_rad_s[:-1] + self.gyro_rad_s[1:]) * np.diff(self.timestamp_s)[:, None]
+
+    @cached_property
+    def _at_samples(self) -> Rotation:
+        """Orientation at each sample (k,), in the frame of the sensor at the first one."""
+        quaternions = Rotation.from_rotvec(np.vstack([np.zeros((1, 3)), self._steps])).as_quat()
+        shift = 1
+        while shift < len(quaternions):  # a product of all rotations before, by doubling
+            before, after = Rotation.from_quat(quaternions[:-shift]), Rotation.from_quat(quaternions[shift:])
+            quaternions[shift:] = (before * after).as_quat()
+            shift *= 2
+        return Rotation.from_quat(quaternions)
+
+    @cached_property
+    def _summed(self) -> Array:
+        """Integral over time of the orientation's matrices up to each sample (k, 3, 3), seconds."""
+        matrices = self._at_samples.as_matrix()
+        steps = 0.5 * (matrices[:-1] + matrices[1:]) * np.diff(self.timestamp_s)[:, None, None]
+        return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+
+    def _places(self, times_s: Array) -> tuple[Indices, Array]:
+        """Return the sample before each time (n,), and the fraction of the step after it."""
+        before = np.clip(np.searchsorted(self.timestamp_s, times_s, side="right") - 1, 0, len(self.timestamp_s) - 2)
+        return before, (times_s - self.timestamp_s[before]) / (self.timestamp_s[before + 1] - self.timestamp_s[before])
+
+    def orientation(self, times_s: Array) -> Rotation:
+        """Return the orientation at times (n,) within the log, by the gyroscope, in the frame of its first sample.
+
+        Rates are constant between two samples, at their mean.
+        """
+        before, fraction = self._places(times_s)
+        return self._at_samples[before] * Rotation.from_rotvec(fraction[:, None] * self._steps[before])
+
+    def nearest_quaternions(self, times_s: Array) -> Array:
+        """Return the orientation (..., 4) at the samples nearest to times (...,)."""
+        before, fraction = self._places(times_s)
+        return np.asarray(self._quaternions[before + (fraction > 0.5)])
+
+    @cached_property
+    def _quaternions(self) -> Array:
+        return np.asarray(self._at_samples.as_quat())
+
+    def knows(self, from_s: Array, to_s: Array) -> Mask:
+        """Return whether the log has no gap between two times (...,) each, and reaches over both."""
+        of_gaps = np.flatnonzero(np.diff(self.timestamp_s) > self.longest_gap_s)
+        starts_s, ends_s = self.timestamp_s[of_gaps], self.timestamp_s[of_gaps + 1]
+        inside = (from_s >= self.timestamp_s[0]) & (to_s <= self.timestamp_s[-1])
+        return np.asarray(inside & (np.searchsorted(starts_s, to_s) <= np.searchsorted(ends_s, from_s, side="right")))
+
+    def turns_between(self, from_s: Array, to_s: Array) -> Array:
+        """Return the turn (n, 3) from one time to another by the gyroscope, a rotation vector in the sensor's frame."""
+        return np.asarray((self.orientation(from_s).inv() * self.orientation(to_s)).as_rotvec())
+
+    def turns_by_bias(self, from_s: Array, to_s: Array) -> Array:
+        """Return the derivatives (n, 3, 3) of the turns by a bias of the rates, to first order.
+
+        Source: Forster, Carlone, Dellaert, Scaramuzza, "On-manifold preintegration for real-time visual-inertial
+        odometry", T-RO 2017, section VI-C.
+        """
+        last = self.orientation(to_s)
+        integral = self._integral(to_s) - self._integral(from_s)
+        turns = self.turns_between(from_s, to_s)
+        return np.asarray(-np.linalg.inv(left_jacobians(-turns)) @ (np.swapaxes(last.as_matrix(), 1, 2) @ integral))
+
+    def _integral(self, times_s: Array) -> Array:
+        before, fraction = self._places(times_s)
+        seconds = fraction * (self.timestamp_s[before + 1] - self.timestamp_s[before])
+        middle = self._at_samples[before] * Rotation.from_rotvec(0.5 * fraction[:, None] * self._steps[before])
+        return np.asarray(self._summed[before] + middle.as_matrix() * seconds[:, None, None])
