@@ -23,7 +23,7 @@ from rangesfm.measurements.ranges.readers.times import (
     DATE_ORDERS,
     SECONDS_PER_UNIT,
     TIME_OF_DAY,
-    CivilClock,
+    Clock,
     date_order,
 )
 from rangesfm.measurements.ranges.readers.units import (
@@ -234,10 +234,10 @@ def _civil_times(table: TextTable, unit: str | None, notes: list[str], ask: Ask)
     order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
     if order is None:
         raise ask(DATE_ORDERS, f"dates such as {dates[0]}")
-    clock, seconds = CivilClock(order), np.empty(len(table))
+    clock, seconds = Clock(order), np.empty(len(table))
     for row, text in enumerate(texts):
         try:
-            seconds[row] = clock.seconds(text)
+            seconds[row] = clock.civil_seconds(text)
         except ValueError:
             expected = f"a date as {order} and a time" if dates else "a time such as 2026-01-31T12:00:00.000Z"
             raise table.error(row, "timestamp", expected) from None

@@ -20,7 +20,7 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID
 from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
 from rangesfm.measurements.ranges.readers.readings import Reading, reader_of_readings
-from rangesfm.measurements.ranges.readers.times import HostClock
+from rangesfm.measurements.ranges.readers.times import Clock
 from rangesfm.util.files.text_tables import read_text
 
 LOST = Reading(0.0, "", math.nan)
@@ -57,16 +57,16 @@ def _reader(
     has_time = "time" in phrase.groupindex
 
     def readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-        clock, lost, num_found = HostClock(path, options), (0, ""), 0
+        clock, lost, num_found = Clock(options.timestamp_unit), (0, ""), 0
         for line, text in numbered_lines(path):
             num_begun = len(begun.findall(text))
             at = first.search(text) if num_begun else None
             if at is None:
                 continue
-            timestamp_s = 0.0 if has_time else clock.seconds(text[: at.start()], line)
+            timestamp_s = math.nan if has_time else clock.find_seconds(text[: at.start()])
             found = list(phrase.finditer(text))
             for one in found:
-                yield from ranges(one, clock.seconds(one["time"], line) if has_time else timestamp_s, line)
+                yield from ranges(one, clock.find_seconds(one["time"]) if has_time else timestamp_s, line)
             yield from [LOST] * (num_begun - len(found))
             num_found, lost = num_found + len(found), lost if lost[0] or found else (line, text)
         if lost[0] and not num_found:
@@ -203,43 +203,29 @@ _QORVO_MEASUREMENT = re.compile(
 
 
 def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-    """Yield the ranges with the host's time before a record, or if there is none, by the radio's interval count."""
-    text, clock = read_text(path, errors="replace"), HostClock(path, options)
-    has_host_time, count = None, -1
+    """Yield the ranges with the host's time before a record, and the time by the radio's count of intervals."""
+    text, clock, counted_s = read_text(path, errors="replace"), Clock(options.timestamp_unit), -math.inf
     begins = list(_QORVO_BEGIN.finditer(text))
     line_starts = [0, *(end.end() for end in re.finditer("\n", text))]
     for begin, stop in zip(begins, [*(begin.start() for begin in begins[1:]), len(text)]):
         end = _QORVO_END.search(text, begin.end(), stop)
         body = text[begin.start() : stop if end is None else end.end()]
         line = bisect_right(line_starts, begin.start())
-        prefix = text[line_starts[line - 1] : begin.start()]
-        if has_host_time is None:
-            has_host_time = clock.find_seconds(prefix) is not None
-        if has_host_time:
-            timestamp_s = clock.seconds(prefix, line)
-        else:
-            count = _qorvo_count(body, count, path, line)
-            timestamp_s = count * options.ranging_interval_s
+        timestamp_s = clock.find_seconds(text[line_starts[line - 1] : begin.start()])
+        found = next(filter(None, (counter.search(body) for counter in _QORVO_COUNTERS)), None)
+        before_s, counted_s = counted_s, math.nan if found is None else int(found[1]) * options.ranging_interval_s
+        if math.isnan(timestamp_s) and counted_s < before_s:
+            raise InputError(
+                f"the radio's count goes back to {counted_s / options.ranging_interval_s:.0f}: it was restarted; split "
+                "the log there, or record it with the host's time before each record",
+                path,
+                line,
+            )
         measurements = list(_QORVO_MEASUREMENT.finditer(body))
-        for found in measurements:
-            anchor_id, range_cm = found["id"] or found["json_id"], found["cm"] or found["json_cm"]
-            yield Reading(timestamp_s, anchor_id, int(range_cm) / 100, line)
+        for one in measurements:
+            anchor_id, range_cm = one["id"] or one["json_id"], one["cm"] or one["json_cm"]
+            yield Reading(timestamp_s, anchor_id, int(range_cm) / 100, line, counted_s=counted_s)
         yield from [LOST] * (len(_QORVO_EACH.findall(body)) - len(measurements))
-
-
-def _qorvo_count(body: str, last: int, path: Path, line: int) -> int:
-    found = next(filter(None, (counter.search(body) for counter in _QORVO_COUNTERS)), None)
-    if found is None:
-        raise InputError("neither a time before the record nor a block_index in it, expected one", path, line)
-    count = int(found[1])
-    if count < last:
-        raise InputError(
-            f"the radio's count goes back from {last} to {count}: it was restarted; split the log "
-            "there, or record it with the host's time before each record",
-            path,
-            line,
-        )
-    return count
 
 
 _BLANKS = r"[ \t]{0,9}"

@@ -24,7 +24,12 @@ from rangesfm.options import TIME_S
 
 
 class Reading(NamedTuple):
-    """A range as a radio reports it (see RangeLog); one that is not a positive number means no measurement."""
+    """A range as a radio reports it (see RangeLog); one that is not a positive number means no measurement.
+
+    Attributes:
+        timestamp_s: by the clock of the host or in a message; NaN if there is none.
+        counted_s: by the radio's own count; NaN if there is none.
+    """
 
     timestamp_s: float
     anchor_id: str
@@ -33,6 +38,7 @@ class Reading(NamedTuple):
     tag_id: str = DEFAULT_TAG_ID
     range_stddev_m: float = math.nan
     los: int = -1
+    counted_s: float = math.nan
 
 
 def refuse_options_of_tables(options: ReadOptions, path: Path) -> None:
@@ -47,15 +53,30 @@ def log_of_readings(
 ) -> RangeLog:
     """Return the log of some ranges, without those that are no measurements.
 
+    The times are those of the host, or those that the radio counts where the host's are missing or all the same.
+
     Raises:
-        InputError: there is no measurement, or the unit of the times is ambiguous.
+        InputError: there is no measurement, a time is missing, or the unit of the times is ambiguous.
     """
     ranges = np.array([reading.range_m for reading in found], np.float64)
     link = Categories.from_texts([f"{reading.tag_id} {reading.anchor_id}" for reading in found]).index
     measured, of_codes = which_are_measured(ranges, link, path)
     measured[measured], of_far = which_are_within_reach(ranges[measured], path)
-    times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
-    times_s, of_times = _times(np.array(times, np.float64), path, options)
+    times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los, counted = zip(*compress(found, measured))
+    times_s, counted_s, of_times = np.array(times, np.float64), np.array(counted, np.float64), list[str]()
+    stand_still = not np.ptp(times_s) and np.ptp(counted_s) > 0
+    if not np.isnan(counted_s).any() and (np.isnan(times_s).any() or stand_still):
+        times_s = counted_s
+        of_times.append("no time of the host in front of the lines: the time is the radio's count")
+    if np.isnan(times_s).any():
+        raise InputError(
+            "no time before the range; this radio prints no times, so record the log with the host's time at the "
+            "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
+            path,
+            lines[int(np.argmax(np.isnan(times_s)))],
+        )
+    times_s, more = _continued(times_s, path, options)
+    of_times += more
     return RangeLog.from_arrays(
         anchor_ids,
         ranges_m,
@@ -71,7 +92,7 @@ def log_of_readings(
     )
 
 
-def _times(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array, list[str]]:
+def _continued(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array, list[str]]:
     """Return times (n,) in seconds, continued where a counter begins again, and notes.
 
     Whole numbers without a unit that are too far apart for seconds are ms or us since the board was started.

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from rangesfm.errors import InputError
-from rangesfm.measurements.ranges.readers.reader import ReadOptions
 from rangesfm.measurements.ranges.twr import SECONDS_PER_STAMP
 from rangesfm.util.files.clock_times import are_seconds_since_1970
 
@@ -102,15 +100,16 @@ def time_in_front(text: str) -> str | None:
     return number[0] if is_time else None
 
 
-class CivilClock:
-    """Reader of successive civil times; times of day without a date continue after midnight."""
+class Clock:
+    """Reader of the successive times of one log; times of day without a date continue after midnight."""
 
-    def __init__(self, order: str = "ymd") -> None:
-        self._order = order
+    def __init__(self, unit: str | None = None) -> None:
+        """Make a clock; ``unit`` is that of the times or the order of dates, None: as their texts and sizes tell."""
+        self._unit = unit
         self._days = 0
         self._last_of_day_s = 0.0
 
-    def seconds(self, text: str) -> float:
+    def civil_seconds(self, text: str) -> float:
         """Return the seconds since 1970, or for a time of day since the midnight before the first one.
 
         Raises:
@@ -118,36 +117,27 @@ class CivilClock:
         """
         of_day = TIME_OF_DAY.fullmatch(text)
         if of_day is None:
-            return _seconds_from_civil(text, self._order)
+            return _seconds_from_civil(text, self._unit if self._unit in DATE_ORDERS else "ymd")
         seconds = _hour(of_day[1], of_day[4]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
         if seconds < self._last_of_day_s - _DAY_S / 2:
             self._days += 1
         self._last_of_day_s = seconds
         return self._days * _DAY_S + seconds
 
-
-class HostClock:
-    """Reader of the times in one log, each from the text before a range."""
-
-    def __init__(self, path: Path, options: ReadOptions):
-        self._path = path
-        self._unit = options.timestamp_unit
-        self._civil = CivilClock(self._unit if self._unit in DATE_ORDERS else "ymd")
-
-    def find_seconds(self, prefix: str) -> float | None:
-        """Return the time in a text in seconds, or None without one.
+    def find_seconds(self, prefix: str) -> float:
+        """Return the time in a text in seconds, such as the host's time before a range; NaN without one.
 
         It may be ISO 8601, a time of day, or a number of seconds, ms, us or ns.
         """
         is_civil = self._unit in CIVIL_UNITS
         if (is_civil or self._unit is None) and (civil := self._find_civil(prefix)):
             try:
-                return self._civil.seconds(civil)
+                return self.civil_seconds(civil)
             except ValueError:
-                return None
+                return math.nan
         number = _NUMBER.search(prefix)
         if number is None or is_civil:
-            return None
+            return math.nan
         value = float(number[0])
         return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
 
@@ -158,19 +148,3 @@ class HostClock:
             return dated[0]
         of_day = TIME_OF_DAY.search(prefix)
         return of_day and of_day[0]
-
-    def seconds(self, prefix: str, line: int) -> float:
-        """Return the time in a text in seconds.
-
-        Raises:
-            InputError: the text has no time.
-        """
-        seconds = self.find_seconds(prefix)
-        if seconds is None:
-            raise InputError(
-                "no time before the range; this radio prints no times, so record the log with the host's time at the "
-                "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
-                self._path,
-                line,
-            )
-        return seconds
