@@ -12,7 +12,7 @@ from tests.planning.plans import FIVE_ANCHORS_M, loop, planned
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL
 from rangesfm.measurements.positions.control_points import ControlPoint
-from rangesfm.measurements.positions.position_scale import scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
@@ -47,7 +47,9 @@ def test_what_control_points_give_is_what_a_run_states_of_them() -> None:
     stated = []
     for seed in range(8):
         off_m = STDDEV_M * np.random.default_rng(seed).standard_normal(known.position_m.shape)
-        found = scale_by_positions(replace(known, position_m=known.position_m + off_m), plan.trajectory, bending)
+        found = scale_by_positions(
+            PositionScale.begun(replace(known, position_m=known.position_m + off_m), plan.trajectory, bending)
+        )
         stated.append(found.alone.posterior.uncertainty.empirical)
     assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.35)
 

@@ -45,7 +45,7 @@ from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.positions.position_scale import scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
@@ -214,7 +214,7 @@ class Known:
         bending = PhotoBending(
             photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, is_firm, True
         )
-        found = scale_by_positions(known, path, bending)
+        found = scale_by_positions(PositionScale.begun(known, path, bending))
         problem = found.alone.problem
         parts = {part.name: part.alike for part in problem.components}
         covariance = problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))

@@ -27,7 +27,7 @@ from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.positions.position_scale import scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
@@ -93,7 +93,8 @@ def main() -> int:
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(at_m.shape)
         log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), ByTime(at_s), np.arange(len(at_s)))
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
-        found = scale_by_positions(locate_antenna(find_antenna_offset(track, path), path), path, bending)
+        known = locate_antenna(find_antenna_offset(track, path), path)
+        found = scale_by_positions(PositionScale.begun(known, path, bending))
         told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)
         if seed < asked.num_refined:
             told("refined", *refined(whole, track))

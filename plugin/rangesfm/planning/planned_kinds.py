@@ -37,7 +37,8 @@ def kinds_at_truth(planned: PlannedSurvey, bending: MapBending) -> tuple[tuple[K
     def positions() -> PositionScale | None:
         given = planned.antenna and planned.antenna.lasting_s
         surveyed = SurveyedPositions(lasting_s=(given,) if given else LASTING_S)
-        return scale_by_positions(known, planned.trajectory, bending, surveyed, is_at_rest=True) if len(known) else None
+        begun = PositionScale.begun(known, planned.trajectory, bending, surveyed, is_at_rest=True)
+        return scale_by_positions(begun) if len(known) else None
 
     locate: dict[str, Callable[[], KindOnMap | None]] = {
         "known positions are": positions,

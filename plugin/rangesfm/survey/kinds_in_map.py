@@ -27,7 +27,7 @@ from rangesfm.measurements.lengths.locate_lengths import (
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_fit import POSITIONS
-from rangesfm.measurements.positions.position_scale import PositionScale, only_compared, scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -88,16 +88,15 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     known, before = surveyed.located(at.model, at.path), find_kind(at.before, PositionScale)
     if not len(known):
         return None
-    given, notes = (known, at.path, at.bending, surveyed), tuple[str, ...]()
-    is_at_rest, unit = bool(at.before), at.metres_per_unit
-    if not known.is_check.all() and (before is None or before.is_used):
-        try:
-            return scale_by_positions(*given, is_at_rest=is_at_rest, metres_per_unit=unit)
-        except GeometryError as error:
-            if is_at_rest:
-                raise
-            notes = (_not_used(POSITIONS, error),)
-    return only_compared(*given, is_at_rest=is_at_rest, metres_per_unit=unit, notes=notes)
+    begun = PositionScale.begun(known, at.path, at.bending, surveyed, at.metres_per_unit, is_at_rest=bool(at.before))
+    if known.is_check.all() or (before is not None and not before.is_used):
+        return begun
+    try:
+        return scale_by_positions(begun)
+    except GeometryError as error:
+        if at.before:
+            raise
+        return replace(begun, notes=(_not_used(POSITIONS, error),))
 
 
 def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array]) -> SurveyedPositions:

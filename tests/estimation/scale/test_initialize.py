@@ -23,7 +23,7 @@ from rangesfm.measurements.joint_map import KindOnMap, find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.known_positions import KnownPositions
-from rangesfm.measurements.positions.position_scale import scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
@@ -518,7 +518,8 @@ def of_no_ranges(*kinds: KindOnMap) -> ScaleEstimate:
 def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain() -> None:
     known_m = points_in_site(3, 0.5)
     known_m = replace(known_m, covariance_m2=100 * known_m.covariance_m2)
-    positions = scale_by_positions(known_m, turned_path(), WalkBending(in_first_camera(turned_path())))
+    bending = WalkBending(in_first_camera(turned_path()))
+    positions = scale_by_positions(PositionScale.begun(known_m, turned_path(), bending))
     [lengths] = lengths_among(taped(0.502, 0.001), turned_path())
     alone, both = of_no_ranges(positions), of_no_ranges(positions, lengths)
     assert (both.method, both.frame) == ("positions", "site")

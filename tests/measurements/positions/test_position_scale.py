@@ -14,6 +14,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_fit import design_of_positions, determine
 from rangesfm.measurements.positions.position_scale import (
+    PositionScale,
     _doubts_of_axes,
     refuse_open_turn,
     scale_by_positions,
@@ -72,7 +73,7 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    fit = scale_by_positions(replace(wrong, is_check=~used), path(), WalkBending(path()))
+    fit = scale_by_positions(PositionScale.begun(replace(wrong, is_check=~used), path(), WalkBending(path())))
     assert_same(fit.similarity, SITE_FROM_MODEL)
     np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(fit.stddev_m, 0.1)
@@ -93,8 +94,8 @@ def test_three_positions_off_a_line_determine_a_similarity() -> None:
 def test_too_few_positions_are_refused_with_their_number() -> None:
     positions = replace(survey([True] * 4), is_check=np.array([False, True, True, False]))
     with pytest.raises(GeometryError, match=r"^2 known positions are in the map, expected 3 or more that are not on"):
-        scale_by_positions(positions, path(), WalkBending(path()))
-    scale_by_positions(replace(positions, is_check=np.arange(4) == 1), path(), WalkBending(path()))
+        scale_by_positions(PositionScale.begun(positions, path(), WalkBending(path())))
+    scale_by_positions(PositionScale.begun(replace(positions, is_check=np.arange(4) == 1), path(), WalkBending(path())))
 
 
 @pytest.mark.parametrize("row", [1, 2, 3])

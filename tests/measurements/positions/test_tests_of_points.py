@@ -12,7 +12,7 @@ from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.measurements.positions.position_scale import only_compared, scale_by_positions
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.solver.linear_map import Columns
@@ -82,10 +82,9 @@ def found_in(
         is_check=np.array([kind == "check" for kind in of_points]),
     )
     bending, surveyed = WalkBending(PATH), SurveyedPositions(ControlPoints(points))
-    if of_points.count("control") < 3:
-        positions = only_compared(known, PATH, bending, surveyed, is_at_rest=True, metres_per_unit=1.0, notes=())
-    else:
-        positions = scale_by_positions(known, PATH, bending, surveyed, is_at_rest=True)
+    positions = PositionScale.begun(known, PATH, bending, surveyed, is_at_rest=True)
+    if of_points.count("control") >= 3:
+        positions = scale_by_positions(positions)
     return positions.tests(join_kinds((Held(stddev), positions), PATH, IDENTITY, bending, is_at_rest=True), {})
 
 
@@ -144,6 +143,6 @@ def test_control_points_of_which_any_may_be_wrong_are_all_named() -> None:
 def test_points_in_a_map_that_nothing_places_are_not_found_in() -> None:
     known = replace(known_positions([True] * 4, 3), is_check=np.ones(4, dtype=bool))
     bending = WalkBending(PATH)
-    alone = only_compared(known, PATH, bending, SurveyedPositions(), is_at_rest=False, metres_per_unit=1.0, notes=())
+    alone = PositionScale.begun(known, PATH, bending)
     in_site = join_kinds((Held(TIGHT),), PATH, IDENTITY, bending)
     assert alone.tests(in_site, {}).tests == ()

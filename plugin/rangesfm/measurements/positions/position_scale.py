@@ -84,7 +84,8 @@ class PositionScale(KindOnMap):
         known: the positions. path: of the camera, in the model that they are in. bending: of the map.
         surveyed: what the positions were given as.
         similarity: from that model to the site, as a robust fit of the positions alone has it.
-        is_kept: (k,) those that take part in it: all but check points and control points that contradict the others.
+        is_kept: (k,) those that take part in it: all but check points and control points that contradict the others;
+            none where a map that others place is only compared with them.
         weights, stddev_m: (k,) its robust weights, and standard deviations of a coordinate that they assume.
         metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
         is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
@@ -107,6 +108,22 @@ class PositionScale(KindOnMap):
     kind = POSITIONS
     shows_bending = True
     words, remedy = "known positions", "look at the units of both"
+
+    @classmethod
+    def begun(
+        cls,
+        known: KnownPositions,
+        path: Trajectory,
+        bending: MapBending,
+        surveyed: SurveyedPositions = NO_POSITIONS,
+        metres_per_unit: float = 1.0,
+        *,
+        is_at_rest: bool = False,
+    ) -> PositionScale:
+        """Return positions of which none takes part yet."""
+        none, nothing = np.zeros(len(known), dtype=bool), np.zeros(len(known))
+        unfitted = (IDENTITY, none, nothing, nothing + 1.0)
+        return cls(known, path, bending, surveyed, *unfitted, metres_per_unit, is_at_rest)
 
     @property
     def start(self) -> Similarity:
@@ -135,11 +152,6 @@ class PositionScale(KindOnMap):
             if np.abs(step).max() < ROUNDING:
                 break
         return replace(self, similarity=similarity, weights=weights, stddev_m=stddev_m)
-
-    @property
-    def is_left_out(self) -> Mask:
-        """(k,) control points that contradict the others."""
-        return np.asarray(~self.known.is_check & ~self.is_kept)
 
     @property
     def threshold(self) -> float:
@@ -188,7 +200,7 @@ class PositionScale(KindOnMap):
     @property
     def is_used(self) -> bool:
         """Whether any of them takes part; otherwise a map that others place is compared with them."""
-        return not self.known.is_check.all()
+        return bool(self.is_kept.any())
 
     def observed(
         self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
@@ -197,8 +209,7 @@ class PositionScale(KindOnMap):
         del in_site
         known, similarity = self.known, placed
         grouping = grouped_by_time(known, self.weights, max_num // 3)
-        takes_part = self.is_kept & ((self.weights >= OUTLIER_BELOW) | known.is_mark)
-        used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
+        used = np.asarray((abs(grouping) @ np.repeat(self.used, 3)) > 0)
         by_pose = groups_by_pose(known, similarity, self.path, grouping)
         by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
         design = grouping @ design_of_positions(known, similarity, self.path)
@@ -247,7 +258,7 @@ class PositionScale(KindOnMap):
     @property
     def markers(self) -> Mapping[str, Marker]:
         """Marks of the control points that take part."""
-        names = (self.known.names[row] for row in np.flatnonzero(self.takes_part & self.known.is_mark).tolist())
+        names = (self.known.names[row] for row in np.flatnonzero(self.is_kept & self.known.is_mark).tolist())
         return {name: self.surveyed.points.markers[name] for name in names}
 
     def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
@@ -256,7 +267,7 @@ class PositionScale(KindOnMap):
         Outliers of an antenna are left to the loss, because on a map that is one piece drift looks like them.
         """
         known, track, stddev_m = self.known, self.surveyed.antenna, self.stddevs_m(on_map)
-        marks, others = (np.flatnonzero(self.takes_part & of_kind) for of_kind in (known.is_mark, ~known.is_mark))
+        marks, others = (np.flatnonzero(self.is_kept & of_kind) for of_kind in (known.is_mark, ~known.is_mark))
         if len(marks):
             names = tuple(known.names[row] for row in marks.tolist())
             yield MarkedPositions(names, at.points, known.position_m[marks], stddev_m[marks], {})
@@ -277,7 +288,8 @@ class PositionScale(KindOnMap):
     def names_left_out(self) -> list[str]:
         """Names of the control points that contradict the others, or did so before."""
         before = [point.name for point in self.surveyed.points.points if point.kind == LEFT_OUT]
-        return [*(self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()), *before]
+        rows = np.flatnonzero(~self.known.is_check & ~self.is_kept) if self.is_used else np.zeros(0, dtype=np.int64)
+        return [*(self.known.names[row] for row in rows.tolist()), *before]
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
         """Return the tests of each known point, of the antenna's positions, and of all against other kinds."""
@@ -286,14 +298,9 @@ class PositionScale(KindOnMap):
         return tests_of_positions(self, on_map, self.against_others(on_map, by_kind))
 
     @property
-    def takes_part(self) -> Mask:
-        """(k,) control positions that do not contradict the others, outliers of an antenna among them."""
-        return np.asarray(~self.known.is_check & ~self.is_left_out)
-
-    @property
     def used(self) -> Mask:
         """(k,) positions that take part and are no outliers."""
-        return np.asarray(self.takes_part & (self.known.is_mark | (self.weights >= OUTLIER_BELOW)))
+        return np.asarray(self.is_kept & (self.known.is_mark | (self.weights >= OUTLIER_BELOW)))
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that the positions are mirrored, that three of them check nothing, and why the interval is wide."""
@@ -342,66 +349,24 @@ def doubts_of_positions(num_used: int, uncertainty: ScaleUncertainty, *, has_che
 
 
 @with_one_blas_thread
-def scale_by_positions(
-    known: KnownPositions,
-    path: Trajectory,
-    bending: MapBending,
-    surveyed: SurveyedPositions = NO_POSITIONS,
-    *,
-    is_at_rest: bool = False,
-    metres_per_unit: float = 1.0,
-) -> PositionScale:
+def scale_by_positions(begun: PositionScale) -> PositionScale:
     """Estimate the similarity to the site by known positions alone, with contradicting control points left out.
-
-    Arguments are as of ``PositionScale``.
 
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    found = fit_positions(known, path, bending, surveyed, is_at_rest=is_at_rest, metres_per_unit=metres_per_unit)
-    while (without := found.without_worst()) is not None:
-        found = without
-    refuse_open_turn(found.alone.posterior.place)
-    return found
-
-
-def fit_positions(
-    known: KnownPositions,
-    path: Trajectory,
-    bending: MapBending,
-    surveyed: SurveyedPositions,
-    *,
-    is_at_rest: bool = False,
-    metres_per_unit: float = 1.0,
-) -> PositionScale:
-    """Fit known positions to a map robustly, with all control points; arguments and errors as above."""
-    is_kept, nothing = ~known.is_check, np.zeros(len(known))
+    known = begun.known
+    is_kept = ~known.is_check
     if not determine(known, is_kept):
         expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
         raise GeometryError(f"{np.count_nonzero(is_kept)} known positions are in the map, {expected}")
     # A start that few wrong positions do not move; that of a map at rest.
-    start = IDENTITY if is_at_rest else start_of_triples(known, np.flatnonzero(is_kept))
-    begun = PositionScale(
-        *(known, path, bending, surveyed, start, is_kept, nothing, nothing), metres_per_unit, is_at_rest
-    )
-    return begun.fitted()
-
-
-def only_compared(
-    known: KnownPositions,
-    path: Trajectory,
-    bending: MapBending,
-    surveyed: SurveyedPositions,
-    *,
-    is_at_rest: bool,
-    metres_per_unit: float,
-    notes: tuple[str, ...],
-) -> PositionScale:
-    """Return known positions of which none takes part; arguments are as of ``PositionScale``."""
-    none, nothing = np.zeros(len(known), dtype=bool), np.zeros(len(known))
-    compared = replace(known, is_check=~none)
-    unfitted = (IDENTITY, none, nothing, nothing + 1.0)
-    return PositionScale(compared, path, bending, surveyed, *unfitted, metres_per_unit, is_at_rest, notes)
+    start = begun.similarity if begun.is_at_rest else start_of_triples(known, np.flatnonzero(is_kept))
+    found = replace(begun, similarity=start, is_kept=is_kept).fitted()
+    while (without := found.without_worst()) is not None:
+        found = without
+    refuse_open_turn(found.alone.posterior.place)
+    return found
 
 
 def refuse_open_turn(covariance: Array) -> None:
@@ -449,7 +414,7 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
     known, problem = positions.known, on_map.problem
     marks = np.flatnonzero(known.is_mark).tolist()
     columns = {known.names[row]: positions.columns_of(on_map, at_point(known, row)) for row in marks}
-    controls = {known.names[row] for row in marks if positions.takes_part[row]}
+    controls = {known.names[row] for row in marks if positions.is_kept[row]}
     left_out = [name for name in columns if name in positions.names_left_out]
     left = [name for name in columns if name not in left_out]
     if len(left) > 1 and any(each.places_map and each.is_used for each in on_map.kinds if each.kind != positions.kind):
