@@ -35,7 +35,7 @@ _HOME = {
     "associate": "rangesfm.measurements.ranges.association",
     "compare": "rangesfm.comparison.with_reference",
     "compare_models": "rangesfm.comparison.before_after",
-    "estimate_time_offset": "rangesfm.measurements.ranges.clock.time_offset",
+    "estimate_time_offset": "rangesfm.measurements.ranges.time_offset",
     "export_model": "rangesfm.export",
     "export_result": "rangesfm.pipeline.export_result",
     "find_image_times": "rangesfm.sfm.image_times",

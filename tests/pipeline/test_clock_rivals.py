@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.pipeline.clock_rivals import scale_by_rivals
 from rangesfm.util.geometry.similarity import Similarity
 

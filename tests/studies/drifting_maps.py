@@ -65,13 +65,13 @@ from tests.studies.measured_distances import MAST_M, marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import RangesfmError
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.util.geometry.moments import ByPhoto, ByTime

@@ -40,6 +40,7 @@ from tests.studies.measured_distances import KINDS, marks_in
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.photo_bending import PhotoBending
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
@@ -48,7 +49,6 @@ from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.metric_result import MetricResult

@@ -10,9 +10,9 @@ import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.positions.clock import TimedPositions
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.timed_ranges import TimedRanges
+from rangesfm.measurements.ranges.timed_ranges import TimedRanges
 from rangesfm.pipeline.metric_result import Rivals
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.numerics import NORMAL_95

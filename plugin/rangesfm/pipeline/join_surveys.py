@@ -13,13 +13,13 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.anchors.site import local_site
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.run import map_in_metres, with_results

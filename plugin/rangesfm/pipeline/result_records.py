@@ -282,7 +282,7 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         pairs = [(*pair, kind) for kind, of_kind in kinds.items() for pair in of_kind]
         yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
     if (offset := found.path.time_offset) is not None and not offset.is_given:
-        yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs_m)
+        yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs)
     markers = found.inputs.tape.found_markers
     if markers:
         names = [name for name, marker in markers.items() for _ in marker.image_names]

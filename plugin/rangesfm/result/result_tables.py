@@ -218,7 +218,7 @@ class ScaleConsensus(TableFile):
 
 @dataclass(frozen=True)
 class TimeOffsetCurve(TableFile):
-    """Content of ``time_offset_curve.csv``: cost in metres of each time offset that was tried; see CostCurve."""
+    """Content of ``time_offset_curve.csv``: cost in metres of each time offset that was tried; see OffsetCurve."""
 
     NAME: ClassVar[str] = "time_offset_curve.csv"
     time_offset_s: Numbers

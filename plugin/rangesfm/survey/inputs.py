@@ -10,6 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
 from rangesfm.measurements.lengths.tape import Marker, Tape
 from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_markers, read_tape
@@ -23,7 +24,6 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_f
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchor_list
 from rangesfm.measurements.ranges.anchors.anchor_ids import ids_in_log
 from rangesfm.measurements.ranges.anchors.site import Site, local_site, site_of
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges

@@ -13,13 +13,13 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.time_offset import estimate_time_offset
 from rangesfm.progress import Journal
 from rangesfm.sfm.image_times import ImageTimes
 from rangesfm.solver.bending import MapBending, WalkBending

@@ -11,10 +11,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from rangesfm.errors import GeometryError
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory

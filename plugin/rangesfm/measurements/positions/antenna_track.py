@@ -9,11 +9,11 @@ from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.ranges.association import places_on_path
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.photo_names import rows_of_photos

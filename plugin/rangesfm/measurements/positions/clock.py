@@ -1,6 +1,6 @@
 """The time offset of an antenna's positions: their fit to the camera's path at every offset, and at one of them.
 
-The rule by which offsets are found, compared and doubted is that of ranges (``rangesfm.measurements.ranges.clock``).
+The rule by which offsets are found, compared and doubted is that of all kinds (``rangesfm.measurements.clock``).
 """
 
 from __future__ import annotations
@@ -9,17 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.measurements.clock.fit import Observed, OffsetFit, orthonormal
+from rangesfm.measurements.clock.offset import OffsetCurve
+from rangesfm.measurements.clock.path_samples import Cells, PathSamples, centred_columns, moving_path
+from rangesfm.measurements.clock.search import offset_of_motion, require_enough
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
-from rangesfm.measurements.ranges.clock.fit import Observed
-from rangesfm.measurements.ranges.clock.search import Cells, PathSamples, Scanned, centred_columns
-from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stddev
-from rangesfm.measurements.ranges.clock.time_offset import offset_of_motion, path_to_search, require_enough
-from rangesfm.progress import SILENT
 from rangesfm.util.files.photo_names import rows_of_photos, told_none
 from rangesfm.util.geometry.moments import ByPhoto
-from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
+from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import align_points, rounding_of, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -30,15 +29,16 @@ _MUCH_WORSE = 3.0
 
 @dataclass(frozen=True)
 class TimedPositions(Observed):
-    """n positions (n, 3) in metres."""
+    """n positions (n, 3) in metres along a path."""
 
+    path: PathSamples
     position_m: Array
 
     name = "positions"
     remedy = "give the time offset (--positions_time_offset)"
 
     @property
-    def numbers_m(self) -> Array:
+    def numbers(self) -> Array:
         return self.position_m.ravel()
 
     @property
@@ -49,18 +49,40 @@ class TimedPositions(Observed):
     def start_weights(self) -> Array:
         return _weights_by_place(self.position_m)
 
-    def solved(self, points: Array) -> RobustFit:
-        return fit_similarity(points, self.position_m)
+    @property
+    def path_span_s(self) -> float:
+        return self.path.span_s
 
-    def scanned(self, weights: Array, path: PathSamples) -> Scanned:
+    def on_path(self, offset_s: float) -> Mask:
+        return self.path.knows(self.times_s + offset_s)
+
+    def fit(self, offset_s: float, before: OffsetFit | None = None) -> OffsetFit:
+        """Fit a similarity from the path to the positions by reweighted least squares."""
+        here = self.take(self.on_path(offset_s))
+        antenna, scale = np.zeros(len(here.times_s), dtype=np.int64), np.inf if before is None else before.scale
+        points, velocities = self.path.antennas(here.times_s + offset_s, antenna, scale)
+        weights = here.start_weights
+        for _ in range(NUM_REWEIGHTINGS + 1):
+            found = align_points(points, here.position_m, weights=weights)
+            predicted_m = found.apply(points)
+            residuals_m = here.position_m - predicted_m
+            away = np.sqrt(np.mean(residuals_m**2, axis=1)) / here.residual_stddev(residuals_m.ravel())
+            weights = CAUCHY.weights(away)
+        of_coordinates = np.repeat(weights, 3)
+        motions = similarity_motions(predicted_m - predicted_m.mean(axis=0)).reshape(-1, 7)
+        basis = orthonormal(np.sqrt(of_coordinates)[:, None] * motions)  # a straight path leaves a turn open
+        rates = (velocities @ (found.scale * found.rotation).T).ravel()
+        return OffsetFit(offset_s, here, of_coordinates, residuals_m.ravel(), rates, basis, 7, found.scale)
+
+    def scanned(self, weights: Array) -> OffsetCurve:
         """Return the similarity that fits best at each offset.
 
         Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
         Its sums over pairs of points are correlations in time.
         """
-        cells = Cells.from_times(self.times_s, path)
+        cells = Cells.from_times(self.times_s, self.path)
         correlate = cells.correlate
-        squared, *centers, known = centred_columns(path, cells.stride).T
+        squared, *centers, known = centred_columns(self.path, cells.stride).T
         of_path = [cells.of_path(values) for values in (known, *centers, squared)]
         position_m = self.position_m - np.median(self.position_m, axis=0)
         of_log = [cells.of_log(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
@@ -76,34 +98,15 @@ class TimedPositions(Observed):
         strengths = np.linalg.svd(cross, compute_uv=False)
         strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
         explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
-        return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
+        return OffsetCurve(cells.offsets_s, num, total * variation, total * (variation - explained))
 
 
-def fit_similarity(points: Array, position_m: Array) -> RobustFit:
-    """Fit a similarity from (n, 3) points to the coordinates of (n, 3) positions by reweighted least squares."""
-    weights = _weights_by_place(position_m)
-    for _ in range(NUM_REWEIGHTINGS + 1):
-        found = align_points(points, position_m, weights=weights)
-        predicted_m = found.apply(points)
-        residuals_m = position_m - predicted_m
-        away = np.sqrt(np.mean(residuals_m**2, axis=1)) / residual_stddev(residuals_m.ravel())
-        weights = CAUCHY.weights(away)
-    of_coordinates = np.repeat(weights, 3)
-    motions = similarity_motions(predicted_m - predicted_m.mean(axis=0)).reshape(-1, 7)
-    columns = np.sqrt(of_coordinates)[:, None] * motions
-    lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
-    is_shown = strengths > UNDETERMINED * strengths[0]  # a straight path leaves a turn open
-    gradient = np.tile(found.scale * found.rotation, (len(points), 1))
-    return RobustFit(of_coordinates, residuals_m.ravel(), gradient, found.scale, 7, basis[:, is_shown])
-
-
-def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
+def residual_stddev_at(positions: TimedPositions, offset_s: float) -> float:
     """Return the robust stddev of a coordinate's residuals at one offset, metres; infinite with too few positions."""
-    if not path.knows(positions.times_s + offset_s).any():
+    if not positions.on_path(offset_s).any():
         return np.inf
-    fit = positions.fit(path, offset_s, positions.fit(path, offset_s).solved.scale)
-    return fit.residual_stddev_m if fit.is_testable else np.inf
+    fit = positions.fit(offset_s, positions.fit(offset_s))
+    return fit.residual_stddev if fit.is_testable else np.inf
 
 
 def _weights_by_place(position_m: Array) -> Array:
@@ -127,11 +130,11 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         return track
     if path.timestamps_s is None:
         raise InputError("the positions have times but the photos have none: give image times", track.log.path)
-    positions = TimedPositions(moments.timestamp_s, track.log.position_m)
     try:
         require_enough(path, len(track.log), TimedPositions)
-        samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
-        found = offset_of_motion(positions, samples, seed=0, progress=SILENT)
+        samples = moving_path(path, track.antenna_in_cam_m[None], track.association, TimedPositions.remedy)
+        positions = TimedPositions(moments.timestamp_s, samples, track.log.position_m)
+        found = offset_of_motion(positions)
     except GeometryError:
         if track.offset is None:
             raise
@@ -140,7 +143,7 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         return replace(track, offset=found)
     # Of the same positions: a map that drifts fits a part of them better than all.
     offsets_s = (track.offset_s, found.value_s)
-    on_both = np.logical_and(*(samples.knows(positions.times_s + each_s) for each_s in offsets_s))
+    on_both = np.logical_and(*map(positions.on_path, offsets_s))
     compared = positions.take(on_both) if on_both.any() else positions
-    off_m = [residual_stddev_at(compared, samples, each_s) for each_s in offsets_s]
+    off_m = [residual_stddev_at(compared, each_s) for each_s in offsets_s]
     return replace(track, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else track

@@ -12,9 +12,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
+from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.time_offset import estimate_time_offset
 from rangesfm.progress import Progress
 from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -266,7 +266,7 @@ def test_bursts_around_still_photos_are_centred_on_them(num_stops: int, first_ph
     # A burst of two seconds can be moved by two seconds either way before it is half-way to the next photo.
     assert found.stddev_s == pytest.approx(4 / np.sqrt(12), abs=0.05)
     assert "stands still" in found.note
-    best = found.curve.costs_m == found.curve.costs_m.min()
+    best = found.curve.costs == found.curve.costs.min()
     assert np.ptp(found.curve.offsets_s[best]) == pytest.approx(4.0, abs=0.2)
 
 
@@ -366,7 +366,7 @@ def test_laps_that_differ_by_twice_the_noise_are_told_apart() -> None:
     walk = Walk(center, no_turn)
     found = estimate(walk.log(range_times(-1, 71), 3.0), walk.photos(photo_times(70)))
     lap_off = np.abs(np.abs(found.curve.offsets_s - 3.0) - 9.0) < 0.5
-    assert found.curve.costs_m[lap_off].min() < 3 * found.curve.costs_m.min()
+    assert found.curve.costs[lap_off].min() < 3 * found.curve.costs.min()
     assert found.value_s == pytest.approx(3.0, abs=0.03)
     assert found.probability > 0.99
     assert not found.rivals

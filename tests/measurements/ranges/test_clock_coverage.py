@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.time_offset import estimate_time_offset
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]

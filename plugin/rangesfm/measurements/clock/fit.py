@@ -1,6 +1,6 @@
 """Robust fit of observations to the path at one time offset, with the offset's uncertainty and the drift of the clocks.
 
-The observations are ranges, or the coordinates of positions (``rangesfm.measurements.positions.clock``).
+The observations are of any kind that follows the camera: ranges, coordinates of positions, turns of an inertial sensor.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
-from rangesfm.measurements.ranges.clock.offset import TimeOffset
-from rangesfm.measurements.ranges.clock.search import MIN_COVERAGE, OffsetCurve, PathSamples, Scanned, scan_parts
-from rangesfm.measurements.ranges.clock.squares import RobustFit, residual_stddev
-from rangesfm.measurements.ranges.errors.noise import STRETCH_S
+from rangesfm.measurements.clock.offset import OffsetCurve, TimeOffset
+from rangesfm.measurements.clock.path_samples import MIN_COVERAGE, scan_parts
+from rangesfm.measurements.ranges.errors.noise import MIN_NOISE_M, STRETCH_S
 from rangesfm.util.geometry.numerics import (
     MAX_NUM_ROUNDS,
     NEGLIGIBLE_STDDEVS,
@@ -26,6 +25,7 @@ from rangesfm.util.geometry.numerics import (
     SIGNIFICANT_STDDEVS,
     UNDETERMINED,
 )
+from rangesfm.util.geometry.robust_statistics import robust_stddev
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -36,8 +36,6 @@ SEPARATION_S = 0.5
 """Offsets that are nearer to each other are one, and no step of a descent is longer."""
 # A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
 _FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
-# Standard deviation of the bias that all ranges share because of the tag's delay.
-_RANGE_BIAS_STDDEV_M = 0.05
 # Smallest number of blocks of time whose errors count as independent.
 _MIN_NUM_BLOCKS = 12
 # The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
@@ -48,7 +46,9 @@ _MIN_GAIN_STDDEVS = 7.0
 
 @dataclass(frozen=True)
 class Observed(ABC):
-    """What was observed at m times, such as ranges, as a time offset is found from it.
+    """What was observed at m times, such as ranges, and the path along which it was, in any form.
+
+    Each time has as many numbers as a kind has coordinates, n in all, in one unit.
 
     Attributes:
         times_s: (m,) times on the clock of the observing system.
@@ -62,11 +62,15 @@ class Observed(ABC):
     """What the user can do where the motion does not determine the offset."""
     may_drift: ClassVar[bool] = False
     """Whether a drift of the clocks is looked for."""
+    least_stddev: ClassVar[float] = MIN_NOISE_M
+    """Smallest standard deviation of a number."""
+    common_stddev: ClassVar[float] = 0.05
+    """Standard deviation of an error that all numbers share, as that of ranges by the tag's delay, metres."""
 
     @property
     @abstractmethod
-    def numbers_m(self) -> Array:
-        """(n,) observed numbers, as many for each time, such as coordinates."""
+    def numbers(self) -> Array:
+        """(n,) observed numbers."""
 
     @property
     @abstractmethod
@@ -74,134 +78,151 @@ class Observed(ABC):
         """(n,) index of the series that each number belongs to, such as its anchor."""
 
     @property
-    def antenna(self) -> Indices:
-        """(m,) index of the antenna that observed."""
-        return np.zeros(len(self.times_s), dtype=np.int64)
+    def start_weights(self) -> Array:
+        """(m,) weights with which all offsets are compared at first."""
+        return np.ones(len(self.times_s))
 
     @property
     @abstractmethod
-    def start_weights(self) -> Array:
-        """(m,) weights with which all offsets are compared at first."""
+    def path_span_s(self) -> float:
+        """Time from the start of the path to its end."""
 
     @abstractmethod
-    def solved(self, points: Array) -> RobustFit:
-        """Fit the numbers to the (m, 3) places of the antennas, in model units."""
+    def on_path(self, offset_s: float) -> Mask:
+        """Return which of them (m,) are on the path at an offset."""
 
     @abstractmethod
-    def scanned(self, weights: Array, path: PathSamples) -> Scanned:
+    def scanned(self, weights: Array) -> OffsetCurve:
         """Return the best fit at every offset, with (m,) weights and without the lever arm."""
+
+    @abstractmethod
+    def fit(self, offset_s: float, before: OffsetFit | None = None) -> OffsetFit:
+        """Fit those that are on the path at one offset.
+
+        Args:
+            before: fit at this offset or near it, whose scale the lever arm has; None: the lever arm is left out.
+        """
 
     def take(self, rows: Indices | Mask) -> Self:
         """Return some of the observations."""
-        return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: array[rows] for name, array in values.items() if isinstance(array, np.ndarray)})
 
-    def on_path(self, path: PathSamples, offset_s: float, max_num: int) -> Self:
+    def first_on_path(self, offset_s: float, max_num: int) -> Self:
         """Return the first observations that are on the path at an offset, at most ``max_num``."""
-        return self.take(np.flatnonzero(path.knows(self.times_s + offset_s))[:max_num])
+        return self.take(np.flatnonzero(self.on_path(offset_s))[:max_num])
 
-    def scan(self, path: PathSamples, weights: Array) -> OffsetCurve:
-        """Compute cost and score of every offset at which observations and path overlap, without the lever arm.
+    def scan(self, weights: Array) -> OffsetCurve:
+        """Fit at every offset at which observations and path overlap, without the lever arm.
 
         The lever arm makes little difference at this resolution.
 
         Args:
-            path: a path with at least one known pose. weights: (m,).
+            weights: (m,).
         """
-        return scan_parts(self.times_s, path, lambda rows: self.take(rows).scanned(weights[rows], path))
+        return scan_parts(self.times_s, self.path_span_s, lambda rows: self.take(rows).scanned(weights[rows]))
 
-    def fit(self, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
-        """Fit those that are on the path at one offset.
+    @property
+    def deviations(self) -> Array:
+        """Deviations (n,) from the median of all that are alike, such as the ranges to one anchor."""
+        deviations = self.numbers.copy()
+        for rows in rows_by_key(self.alike):
+            deviations[rows] -= np.median(deviations[rows])
+        return deviations
 
-        Args:
-            scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
-        """
-        here = self.take(path.knows(self.times_s + offset_s))
-        points, velocities = path.tag(here.times_s + offset_s, here.antenna, scale)
-        return OffsetFit.from_solution(offset_s, here, here.solved(points), velocities)
+    def residual_stddev(self, residuals: Array) -> float:
+        """Return a robust standard deviation of residuals, at least the smallest one."""
+        return max(robust_stddev(residuals), self.least_stddev)
 
 
 @dataclass(frozen=True)
 class OffsetFit:
-    """Fit of observations to the path at one time offset. Each of them is one of n numbers, or several: coordinates.
+    """Robust fit of observations on the path at one time offset, by linear unknowns of the kind.
 
     Attributes:
         offset_s: image time minus the time of the observations.
-        observed: those on the path.
-        solved: fit of the n numbers by the other unknowns.
-        residuals_m: (n,) residuals of that fit, enlarged to account for its number of unknowns.
-        num_spare: number of independent observations beyond the unknowns.
-        deviations_m: (n,) deviations from the median of all that are alike, such as the ranges to one anchor.
-        rates: (n,) derivative of each predicted number by the offset, m/s.
+        observed: those on the path, with n numbers.
+        weights: (n,) weights of the loss, in [0, 1].
+        raw_residuals: (n,) measured minus fitted.
+        rates: (n,) derivative of each fitted number by the offset, per second.
+        basis: (n, p) orthonormal weighted columns of all unknowns.
+        num_unknowns: their number, also of those that nothing determines.
+        scale: metres per model unit; infinite if it is not determined, or no unknown.
     """
 
     offset_s: float
     observed: Observed
-    solved: RobustFit
-    residuals_m: Array
-    num_spare: int
-    deviations_m: Array
+    weights: Array
+    raw_residuals: Array
     rates: Array
-
-    @classmethod
-    def from_solution(
-        cls,
-        offset_s: float,
-        observed: Observed,
-        solved: RobustFit,
-        velocities: Array,
-    ) -> OffsetFit:
-        """Make a fit from its solution.
-
-        Args:
-            velocities: (m, 3) of the points on the path at the m observations, model units per second.
-        """
-        deviations, alike = observed.numbers_m.copy(), observed.alike
-        for rows in rows_by_key(alike):
-            deviations[rows] -= np.median(deviations[rows])
-        num_each = len(deviations) // max(len(observed.times_s), 1)
-        times_s = np.repeat(observed.times_s, num_each)
-        cells = np.floor(times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
-        num_cells = len(np.unique(cells))
-        num_spare = num_cells - solved.num_unknowns - 1
-        residuals = solved.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
-        rates = np.einsum("ni,ni->n", solved.gradient, np.repeat(velocities, num_each, axis=0))
-        return cls(offset_s, observed, solved, residuals, num_spare, deviations, rates)
+    basis: Array
+    num_unknowns: int
+    scale: float = np.inf
 
     @property
-    def _num_each(self) -> int:
-        return len(self.residuals_m) // max(len(self.observed.times_s), 1)
+    def weighted_residuals(self) -> Array:
+        """Residuals times the roots of their weights (n,)."""
+        return np.asarray(np.sqrt(self.weights) * self.raw_residuals)
+
+    def unexplained(self, values: Array) -> Array:
+        """Return weighted changes of the numbers (n, k) without the parts that the unknowns can explain."""
+        weighted = np.sqrt(self.weights)[:, None] * values
+        return np.asarray(weighted - self.basis @ (self.basis.T @ weighted))
+
+    @property
+    def num_each(self) -> int:
+        """How many numbers each time has."""
+        return len(self.weights) // max(len(self.observed.times_s), 1)
 
     @property
     def times_s(self) -> Array:
         """Times of the numbers (n,)."""
-        return np.repeat(self.observed.times_s, self._num_each)
+        return np.repeat(self.observed.times_s, self.num_each)
 
     @property
-    def weights(self) -> Array:
-        """Robust weights of the observations."""
-        return self.solved.weights[:: self._num_each]
+    def weights_of_each(self) -> Array:
+        """Robust weights of the m observations."""
+        return self.weights[:: self.num_each]
+
+    @cached_property
+    def _num_cells(self) -> int:
+        """Number of observations whose errors may be independent."""
+        alike = self.observed.alike
+        cells = np.floor(self.times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
+        return len(np.unique(cells))
 
     @property
-    def residual_stddev_m(self) -> float:
-        return residual_stddev(self.residuals_m)
+    def num_spare(self) -> int:
+        """Number of independent observations beyond the unknowns."""
+        return self._num_cells - self.num_unknowns - 1
+
+    @cached_property
+    def residuals(self) -> Array:
+        """Residuals (n,), enlarged to account for the number of unknowns."""
+        return np.asarray(self.raw_residuals * np.sqrt(self._num_cells / max(self.num_spare, 0.5)))
+
+    @property
+    def residual_stddev(self) -> float:
+        return self.observed.residual_stddev(self.residuals)
 
     @property
     def is_testable(self) -> bool:
-        """Return whether there are enough ranges to tell a fit from a coincidence."""
-        return self.num_spare >= self.solved.num_unknowns
+        """Return whether there are enough observations to tell a fit from a coincidence."""
+        return self.num_spare >= self.num_unknowns
 
-    def losses(self, stddev_m: float | None = None) -> Array:
+    def losses(self, stddev: float | None = None) -> Array:
         """Return the negative log-likelihood of each residual (n,), up to a constant.
 
         Args:
-            stddev_m: of the residuals; None: their own.
+            stddev: of the residuals; None: their own.
         """
-        return _losses(self.residuals_m, self.residual_stddev_m if stddev_m is None else stddev_m)
+        return _losses(self.residuals, self.residual_stddev if stddev is None else stddev)
 
     @cached_property
     def gains(self) -> Array:
-        """Gain in each range's log-likelihood over a camera that stands still (n,)."""
-        return _losses(self.deviations_m, residual_stddev(self.deviations_m)) - self.losses()
+        """Gain in each number's log-likelihood over a camera that stands still (n,)."""
+        deviations = self.observed.deviations
+        return _losses(deviations, self.observed.residual_stddev(deviations)) - self.losses()
 
     @property
     def score(self) -> float:
@@ -210,7 +231,7 @@ class OffsetFit:
 
     @property
     def num_independent(self) -> float:
-        """Number of ranges with independent errors that carry the same information.
+        """Number of observations with independent errors that carry the same information.
 
         It is found from the variation of the losses between blocks of time, which is larger for correlated errors.
         """
@@ -219,7 +240,7 @@ class OffsetFit:
         return min(self.num_spare, float(np.var(losses)) / max(variance, 1e-300))
 
     def explains(self) -> bool:
-        """Return whether the path explains the ranges better than no motion at all."""
+        """Return whether the path explains the observations better than no motion at all."""
         least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.times_s))
         return bool(self.score > least)
 
@@ -234,10 +255,10 @@ class OffsetFit:
         That of the offset is infinite if the motion does not determine it.
         """
         times = self.times_s - self.times_s.mean()
-        own = self.solved.unexplained(np.stack([self.rates, self.rates * times], axis=1))
+        own = self.unexplained(np.stack([self.rates, self.rates * times], axis=1))
         if not _is_determined(own[:, 0], self.rates):
             return TimeOffset(self.offset_s, np.inf)
-        residuals = self.solved.weighted_residuals
+        residuals = self.weighted_residuals
         change = np.linalg.lstsq(own, residuals, rcond=None)[0]
         alone = self._variances(own[:, :1], residuals, times)
         both = self._variances(own, residuals - own @ change, times)
@@ -245,49 +266,55 @@ class OffsetFit:
         return TimeOffset(self.offset_s, float(np.sqrt(alone[0])), drift=float(change[1]), drift_stddev=drift_stddev)
 
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
-        """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
+        """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and an error of all."""
         # The correlation time is not known. The variance is therefore the mean of the variances with blocks of one, two
         # and four stretches; short logs have the smallest number of blocks, half of it, and twice as many.
         usual = max(_MIN_NUM_BLOCKS, float(np.ptp(times)) / (2 * STRETCH_S))
         blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
-        by_chance = _jackknife_variances(own, residuals, self.solved, blocks)
-        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.solved.weights), rcond=None)[0]
+        by_chance = _jackknife_variances(own, residuals, self, blocks)
+        by_bias = np.linalg.lstsq(own, self.observed.common_stddev * np.sqrt(self.weights), rcond=None)[0]
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(observed: Observed, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
+def orthonormal(columns: Array) -> Array:
+    """Return an orthonormal basis (n, p) of the weighted columns (n, k) of unknowns that are determined."""
+    lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
+    return np.asarray(basis[:, strengths > UNDETERMINED * strengths[0]])
+
+
+def refine_offset(observed: Observed, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
     """Refine an offset by Gauss-Newton steps to the nearest one that fits the observations best.
 
     Args:
         observed: those that are (nearly) all on the path at the given offset.
-        path: the path.
         offset_s: the offset to start from.
         rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
     # The lever arm comes in only after the scale has been estimated.
-    found = observed.fit(path, offset_s, observed.fit(path, offset_s).solved.scale)
+    found = observed.fit(offset_s, observed.fit(offset_s))
     for _ in range(MAX_NUM_ROUNDS):
         if rival is not None and found.is_hopeless_beside(rival):
             break
-        own = found.solved.unexplained(found.rates[:, None])[:, 0]
+        own = found.unexplained(found.rates[:, None])[:, 0]
         if not _is_determined(own, found.rates):
             break
-        step_s = float(own @ found.solved.weighted_residuals / (own @ own))
-        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev_m:
+        step_s = float(own @ found.weighted_residuals / (own @ own))
+        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev:
             break
         offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
-        if np.mean(path.knows(observed.times_s + offset_s)) < MIN_COVERAGE:
+        if np.mean(observed.on_path(offset_s)) < MIN_COVERAGE:
             break
-        found = observed.fit(path, offset_s, found.solved.scale)
+        found = observed.fit(offset_s, found)
     return found
 
 
-def _losses(errors_m: Array, stddev_m: float) -> Array:
+def _losses(errors: Array, stddev: float) -> Array:
     """Return the negative log-likelihoods (n,) of errors by a Cauchy distribution.
 
     Errors that are twice as large, as is their standard deviation, lose log 2.
     """
-    return np.asarray(np.log(stddev_m) + np.log1p((errors_m / stddev_m) ** 2))
+    return np.asarray(np.log(stddev) + np.log1p((errors / stddev) ** 2))
 
 
 def _variance_of_mean(values: Array, times: Array) -> float:
@@ -307,7 +334,7 @@ def _blocks(times: Array, num_blocks: int) -> Indices:
     return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
 
 
-def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks: Sequence[Indices]) -> list[Array]:
+def _jackknife_variances(own: Array, residuals: Array, fit: OffsetFit, blocks: Sequence[Indices]) -> list[Array]:
     """Return the variances (k,) of an M-estimate with residuals correlated within blocks, for each set of blocks.
 
     This is the delete-one-block jackknife, with one Newton step of all unknowns of the fit for each block (Bell and
@@ -317,13 +344,13 @@ def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks
 
     Args:
         own: (n, k) columns of the unknowns, without the parts that other unknowns explain.
-        residuals: (n,) weighted residuals of the fit ``solved``, metres.
-        solved: the fit.
+        residuals: (n,) weighted residuals of the fit ``fit``.
+        fit: the fit.
         blocks: divisions, each the index (n,) of each range's block.
     """
     sizes = np.linalg.norm(own, axis=0)
-    columns = np.column_stack([solved.basis, own / sizes])
-    curving = (2 * solved.weights - 1)[:, None]
+    columns = np.column_stack([fit.basis, own / sizes])
+    curving = (2 * fit.weights - 1)[:, None]
     curvature = columns.T @ (curving * columns)
 
     def variances(block: Indices) -> Array:
@@ -341,7 +368,7 @@ def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks
     return [variances(block) for block in blocks]
 
 
-def fit_clocks(observed: Observed, path: PathSamples, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
+def fit_clocks(observed: Observed, offset_s: float) -> tuple[OffsetFit, TimeOffset]:
     """Refine an offset, and if the observations show a significant drift, offset and drift together.
 
     Returns:
@@ -349,7 +376,7 @@ def fit_clocks(observed: Observed, path: PathSamples, offset_s: float) -> tuple[
         drift.
     """
     reference_s = float(observed.times_s.mean())
-    fit = refine_offset(observed, path, offset_s)
+    fit = refine_offset(observed, offset_s)
     found, followed, least_stddevs = fit.timed(), 0.0, SIGNIFICANT_STDDEVS
     for _ in range(MAX_NUM_ROUNDS if observed.may_drift else 0):
         if not abs(found.drift) > least_stddevs * found.drift_stddev:
@@ -357,7 +384,7 @@ def fit_clocks(observed: Observed, path: PathSamples, offset_s: float) -> tuple[
         followed, least_stddevs = followed + found.drift, NEGLIGIBLE_STDDEVS
         # The times become those of a radio clock that runs at the rate of the camera's.
         times_s = observed.times_s + followed * (observed.times_s - reference_s)
-        fit = refine_offset(replace(observed, times_s=times_s), path, fit.offset_s)
+        fit = refine_offset(replace(observed, times_s=times_s), fit.offset_s)
         found = fit.timed()
     note = _drift_note(followed, found.drift_stddev, observed.times_s) if followed else ""
     drift, is_followed = followed or found.drift, followed != 0

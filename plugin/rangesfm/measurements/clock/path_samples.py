@@ -1,4 +1,4 @@
-"""Search over all time offsets: the fit of what was observed at every offset, computed at once by correlation.
+"""PathSamples: the camera's path, evenly sampled in time, and fits along it at all time offsets by correlation.
 
 The sums in the normal equations of a linear fit are correlations in time of observations with products of |c|^2, c and
 1 along the path. Fast Fourier transforms therefore give the best fit at all offsets in one pass.
@@ -7,22 +7,19 @@ The sums in the normal equations of a linear fit are correlations in time of obs
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.ndimage import maximum_filter1d
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.clock.offset import CostCurve
-from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.errors import GeometryError
+from rangesfm.measurements.clock.offset import OffsetCurve
+from rangesfm.measurements.ranges.association import places_on_path
 from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.similarity import rounding_of
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around, places_in_time
 
 # Time between samples of the path, and between offsets: a twentieth of the time in which a walker's motion changes.
 # Linear interpolation between samples is off by less than a millimetre at an acceleration of 3 m/s^2.
@@ -30,9 +27,9 @@ _STEP_S = 0.05
 # Largest number of samples, and of offsets; if path and log together last more than seven hours, the step is longer.
 _MAX_NUM_STEPS = 500_000
 MIN_COVERAGE = 0.5
-"""Fraction of the largest possible number of ranges on the path; an offset that puts fewer there is not tried."""
-# Number of offsets in the curve for the report that are taken from all, and of those nearest to the best one.
-_NUM_SHOWN = 200
+"""Fraction of the largest possible number of observations on the path; an offset that puts fewer there is not tried."""
+# To find the offset, poses are also interpolated across gaps up to this many times the median gap between photos.
+_MAX_GAPS = 1.5
 
 
 @dataclass(frozen=True)
@@ -43,14 +40,14 @@ class PathSamples:
         start_s: time of the first pose, camera's clock.
         step_s: time between poses.
         centers: (m, 3) camera centres, model units; 0 where unknown.
-        tag_from_center: (num_tags, m, 3) lever arms in the axes of the world, metres.
+        arms_m: (num_antennas, m, 3) lever arms in the axes of the world; 0 where unknown.
         is_known: (m,) whether the pose is known.
     """
 
     start_s: float
     step_s: float
     centers: Array
-    tag_from_center: Array
+    arms_m: Array
     is_known: Mask
 
     def __len__(self) -> int:
@@ -63,12 +60,17 @@ class PathSamples:
         before = np.where(inside, place, 0).astype(np.int64)
         return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
 
-    def tag(self, times_s: Array, tag: Indices, scale: float) -> tuple[Array, Array]:
-        """Return positions and velocities of tags' antennas at times at which the pose is known.
+    @property
+    def span_s(self) -> float:
+        """Time from the first pose to the last."""
+        return self.step_s * (len(self) - 1)
+
+    def antennas(self, times_s: Array, antenna: Indices, scale: float) -> tuple[Array, Array]:
+        """Return positions and velocities of antennas at times at which the pose is known.
 
         Args:
             times_s: (n,) times, camera's clock.
-            tag: (n,) index of the tag at each time.
+            antenna: (n,) index of the one that observed at each time.
             scale: metres per model unit; infinity leaves the lever arm out.
 
         Returns:
@@ -76,107 +78,88 @@ class PathSamples:
         """
         place = (times_s - self.start_s) / self.step_s
         before = np.clip(place, 0, len(self) - 2).astype(np.int64)
-        points = self.centers + self.tag_from_center / scale
-        here = points[tag, before]
-        step = points[tag, before + 1] - here
+        points = self.centers + self.arms_m / scale
+        here = points[antenna, before]
+        step = points[antenna, before + 1] - here
         return here + (place - before)[:, None] * step, step / self.step_s
 
 
-def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: RangesOptions) -> PathSamples:
-    """Sample the path where poses are interpolated between keyframes.
+def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: RangesOptions, remedy: str) -> PathSamples:
+    """Sample the path of keyframes with times, also across longer gaps than those in which observations are used.
 
     Args:
-        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+        antennas_in_cam_m: (num, 3) lever arms, metres. remedy: what the user can do if no part of the path is known.
+
+    Raises:
+        GeometryError: poses can be interpolated nowhere.
     """
+    keyframes_s = _times(trajectory)
+    start_s, step_s, num = _steps(keyframes_s, 0.0)
+    times_s: Array = start_s + step_s * np.arange(num, dtype=np.float64)
+    gap_s = max(_MAX_GAPS * float(np.median(np.diff(keyframes_s))), options.max_interpolation_gap_s)
+    at = places_in_time(times_s, keyframes_s, max_gap_s=gap_s, max_difference_s=-1.0)
+    is_known = at.before >= 0
+    num_known = int(np.count_nonzero(is_known))
+    if num_known < 2:
+        raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {remedy}")
+    options = options.model_copy(update={"max_interpolation_gap_s": gap_s})
+    centers, arms_m = np.zeros((num, 3)), np.zeros((len(antennas_in_cam_m), num, 3))
+    for own_m, arm_m in zip(arms_m, antennas_in_cam_m, strict=True):
+        own = np.tile(arm_m, (num_known, 1))
+        places = places_on_path(trajectory, own, at.subset(is_known), time_resolution_s=0.0, options=options)
+        centers[is_known], own_m[is_known] = places.centers, places.arms_m
+    return PathSamples(start_s, step_s, centers, arms_m, is_known)
+
+
+def standing_path(trajectory: Trajectory, antennas_in_cam_m: Array, reach_s: float) -> PathSamples:
+    """Sample the path of a camera that stands still from ``reach_s`` before to as long after each keyframe."""
+    keyframes_s = _times(trajectory)
+    start_s, step_s, num = _steps(keyframes_s, reach_s)
+    times_s: Array = start_s + step_s * np.arange(num, dtype=np.float64)
+    nearest = keyframes_around(times_s, keyframes_s).nearest
+    is_known = np.abs(times_s - keyframes_s[nearest]) <= reach_s
+    arms_m = np.einsum("nij,aj->ani", trajectory.world_from_cam[nearest], antennas_in_cam_m)
+    return PathSamples(start_s, step_s, trajectory.centers[nearest], arms_m, is_known)
+
+
+def _times(trajectory: Trajectory) -> Array:
     assert trajectory.timestamps_s is not None, "a path in time needs times"
-    start_s = float(trajectory.timestamps_s[0])
-    span_s = float(trajectory.timestamps_s[-1]) - start_s
+    return trajectory.timestamps_s
+
+
+def _steps(keyframes_s: Array, beyond_s: float) -> tuple[float, float, int]:
+    """Return the first time of samples, the time between them and their number."""
+    start_s, span_s = float(keyframes_s[0]) - beyond_s, float(np.ptp(keyframes_s)) + 2 * beyond_s
     step_s = max(_STEP_S, span_s / _MAX_NUM_STEPS)
-    times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
-    probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
-    # With a negative tolerance, a sample next to a keyframe is interpolated like all others.
-    options = options.model_copy(update={"max_time_difference_s": -1.0})
-    by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
-    places = by_tag[0]
-    is_known = (places.status == RangeStatus.USED) & (places.before != places.after)
-    known = is_known[:, None]
-    tag_from_center = np.stack([np.where(known, places_of_tag.tag_from_center, 0.0) for places_of_tag in by_tag])
-    return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
+    return start_s, step_s, int(span_s / step_s) + 1
 
 
-@dataclass(frozen=True)
-class OffsetCurve(CostCurve):
-    """Cost and score of m offsets that put a large enough fraction of the ranges on the path.
-
-    Attributes:
-        scores: (m,) natural logarithm of the ratio of the ranges' own variation to their residuals; 0 if the path
-            explains nothing.
-    """
-
-    scores: Array
-
-    def around(self, best_s: float) -> CostCurve:
-        """Return a curve for the report: the best offset of each interval, and those nearest to the best one of all."""
-        fine = np.argsort(np.abs(self.offsets_s - best_s))[:_NUM_SHOWN]
-        stretches = np.array_split(np.arange(len(self.offsets_s)), min(_NUM_SHOWN, len(self.offsets_s)))
-        coarse = [rows[np.argmin(self.costs_m[rows])] for rows in stretches]
-        shown = np.unique(np.concatenate([fine, coarse]))
-        return CostCurve(self.offsets_s[shown], self.costs_m[shown])
-
-    def peaks(self, separation_s: float, max_num: int) -> list[float]:
-        """Return the offsets whose score is the highest within ``separation_s``, the best first."""
-        if len(self.offsets_s) < 2:
-            return list(map(float, self.offsets_s))
-        step_s = float(np.median(np.diff(self.offsets_s)))
-        highest = maximum_filter1d(self.scores, 2 * round(separation_s / step_s) + 1)
-        peaks = np.flatnonzero(self.scores == highest)
-        best = peaks[np.argsort(-self.scores[peaks], kind="stable")[:max_num]]
-        return list(map(float, self.offsets_s[best]))
-
-
-def scan_parts(times_s: Array, path: PathSamples, scan: Callable[[Indices], Scanned]) -> OffsetCurve:
+def scan_parts(times_s: Array, path_span_s: float, scan: Callable[[Indices], OffsetCurve]) -> OffsetCurve:
     """Join what was computed for the parts of a log, without the offsets that put few observations on the path.
+
+    A log is split at pauses longer than the path, because no offset puts both sides on the path. A clock that starts at
+    zero and is set to the date later therefore causes no huge search.
 
     Args:
         times_s: (n,) of the observations. scan: returns the result for some of them.
     """
-    scanned: list[Scanned] = []
+    order = np.argsort(times_s, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(times_s[order]) > path_span_s) + 1)
+    scanned: list[OffsetCurve] = []
     most = 0.0
-    for rows in sorted(_parts(times_s, len(path) * path.step_s), key=len, reverse=True):
+    for rows in sorted(parts, key=len, reverse=True):
         if len(rows) < MIN_COVERAGE * most:
             break
         scanned.append(scan(rows))
-        most = max(most, float(scanned[-1].num_on_path.max()))
-    num_on_path, offsets, variation, residual = (np.concatenate(column) for column in zip(*scanned))
-    tried = np.flatnonzero(num_on_path >= max(1.0, MIN_COVERAGE * most))
-    order = tried[np.argsort(offsets[tried], kind="stable")]
-    floor = 1e-12 * max(float(variation.max()), 1e-300)
-    left, whole = np.maximum(residual[order], floor), np.maximum(variation[order], floor)
-    costs = np.sqrt(left / np.maximum(num_on_path[order], 1.0))
-    return OffsetCurve(offsets[order], costs, 0.5 * np.log(whole / left))
-
-
-def _parts(times: Array, path_span_s: float) -> list[Indices]:
-    """Split the rows of the log at pauses longer than the path, because no offset puts both sides on the path.
-
-    A clock that starts at zero and is set to the date later therefore causes no huge search.
-    """
-    order = np.argsort(times, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(times[order]) > path_span_s) + 1)
-
-
-class Scanned(NamedTuple):
-    """Sums over the observations on the path at m offsets, with the best fit at each.
-
-    Attributes:
-        num_on_path: (m,) sums of weights. offsets_s: (m,).
-        variation, residual: (m,) sums of squares of what is to be explained, and of what is left of it, square metres.
-    """
-
-    num_on_path: Array
-    offsets_s: Array
-    variation: Array
-    residual: Array
+        most = max(most, float(scanned[-1].weight.max()))
+    of_all = OffsetCurve(
+        *(np.concatenate([getattr(each, field.name) for each in scanned]) for field in fields(OffsetCurve))
+    )
+    tried = np.flatnonzero(of_all.weight >= max(1.0, MIN_COVERAGE * most))
+    floor = 1e-12 * max(float(of_all.variation.max()), 1e-300)
+    kept = of_all.take(tried[np.argsort(of_all.offsets_s[tried], kind="stable")])
+    variation, residual = (np.maximum(values, floor) for values in (kept.variation, kept.residual))
+    return replace(kept, variation=variation, residual=residual)
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,0 @@
-"""Estimation of the offset between the clocks of radio and camera."""
