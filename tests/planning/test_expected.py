@@ -108,6 +108,9 @@ def test_what_is_known_of_the_radio_counts() -> None:
     better = expect(planned(FIVE_ANCHORS_M, "site", component_stddevs={"tag_antenna": 0.0025}))
     assert better.uncertainty.components["tag_antenna"] < 0.2 * usual.uncertainty.components["tag_antenna"]
     assert better.uncertainty.empirical < 0.95 * usual.uncertainty.empirical
+    # A radio that is noisier than usual has larger errors of all kinds, as in a run.
+    noisy = expect(planned(FIVE_ANCHORS_M, "site", component_stddevs={"white": 0.4}))
+    assert noisy.uncertainty.components["curve"] > 3 * usual.uncertainty.components["curve"]
 
 
 def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:

@@ -33,6 +33,8 @@ from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.components import COMPONENTS, stddevs_in
+from rangesfm.measurements.ranges.errors.learned import widening
+from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
@@ -43,6 +45,7 @@ from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_ranges import true_state
+from rangesfm.solver.bending import BENDS
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -136,9 +139,10 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
     """Stddevs of the components of the range errors: the plan's, or those that radios have on average."""
-    is_calibrated = planned.curve_stddev_m is not None
+    is_calibrated, given = planned.curve_stddev_m is not None, planned.component_stddevs
     usual = {each.name: float(each.median_if(is_calibrated) * np.exp(each.spread**2)) for each in COMPONENTS}
-    return usual | {"bending": BENDING_M} | dict(planned.component_stddevs)
+    stddevs, larger = usual | {"bending": BENDING_M} | dict(given), widening(given.get("white", START_STDDEV_M))
+    return {name: size * (1.0 if name in ("white", *BENDS) else larger) for name, size in stddevs.items()}
 
 
 def measured(

@@ -62,7 +62,7 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     errors = replace(posed.errors.at(tags_m, placing_m), stddev_m=stddev_m)
     problem = weighted(posed.ranges, errors)
     fit = fit_at(problem, state, np.full(len(posed.rows), float(planned.num_alike)))
-    return ranges.solved(posed, Solution(problem, fit, errors, START_STDDEV_M))
+    return ranges.solved(posed, Solution(problem, fit, errors, noise_m))
 
 
 def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
@@ -141,7 +141,7 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     if ranges is None:
         return ()
     here, bins = ranges_on_map(ranges.posed, ranges.solution, ranges.bending), ranges.learnt(on_map).bins
-    joint = joined([in_bins(here, bins, START_STDDEV_M, {}, np.zeros(len(bins)))], here.bending)
+    joint = joined([in_bins(here, bins, ranges.solution.noise_stddev_m, {}, np.zeros(len(bins)))], here.bending)
     problem = Linearized(**vars(joint), on_map=here, bins=bins, scatter_m=0.0)
     found = []
     for test in Factorization(problem).estimates([each for of_kind in STANDING for each in of_kind(problem)]):

@@ -81,9 +81,14 @@ def radio_components(
     return (*found, *(Component(name, covariance) for name, covariance in known.items()))
 
 
+def widening(noise_m: float) -> float:
+    """Return how many times as large as those of a usual radio all lasting errors of one with this noise are."""
+    return float(max(1.0, noise_m / START_STDDEV_M) ** _WIDENING_POWER)
+
+
 def widened(components: Sequence[Component], noise_m: float) -> tuple[Component, ...]:
     """Return the components of the errors of ranges with this noise, of which a noisier radio than usual has more."""
-    larger = max(1.0, noise_m / START_STDDEV_M) ** (2 * _WIDENING_POWER)
+    larger = widening(noise_m) ** 2
     # Bending does not depend on the radio, and the noise is measured itself.
     return tuple(
         replace(each, alike=larger * each.alike) if each.spread > 0 and each.name not in (*BENDS, "white") else each
