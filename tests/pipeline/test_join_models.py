@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.demo.simulated_radio import CameraPath, Radio
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.model_placement import ScaledModel, place_models
+from rangesfm.estimation.scale.model_placement import Piece, place_pieces
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import local_site
@@ -112,18 +114,23 @@ class Halves:
         )
 
 
-def walk() -> Halves:
-    """Simulate a loop with large changes of height, and ranges to four anchors at each photo."""
+def walked() -> CameraPath:
+    """Return a loop with large changes of height."""
     level = loop_path(NUM_PHOTOS + 2.0, start_s=99.0, seed=3)
     knots = np.linspace(99.0, 101.0 + NUM_PHOTOS, NUM_PHOTOS + 3)
     centers = level.centers(knots) + np.outer(0.8 * np.sin(0.9 * knots), [0, 0, 1])
-    path = CameraPath.through(knots, centers, level.world_from_cam(knots))
+    return CameraPath.through(knots, centers, level.world_from_cam(knots))
+
+
+def walk(anchors_m: Mapping[str, tuple[float, float, float]] = ANCHORS_M) -> Halves:
+    """Simulate its photos, and ranges to four anchors at each."""
+    path = walked()
     times = np.arange(100.0, 100.0 + NUM_PHOTOS)
     made = synthetic_model(
         times, path.centers(times), path.world_from_cam(times), num_observations=30, max_track_length=8, seed=1
     )
     at = np.repeat(times, 2)
-    log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), ANCHORS_M, TAG_IN_CAM_M, Radio(), 5)
+    log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), anchors_m, TAG_IN_CAM_M, Radio(), 5)
     names, rng, parts = list(made.timestamps_s), np.random.default_rng(0), []
     for number, others in enumerate((names[HALF:], names[:HALF])):
         model = rescale(without_photos(made.reconstruction, others), random_similarity(rng))
@@ -168,12 +175,20 @@ def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_
     assert warnings == []
     # Places are searched for with a part of the ranges.
     monkeypatch.setattr("rangesfm.estimation.scale.model_placement.ENOUGH_TO_SEARCH", 6)
-    pairs = zip(rough.parts, verdicts, strict=True)
-    models = [
-        ScaledModel(part.trajectory, known(verdict.estimate), is_in_anchor_frame=False) for part, verdict in pairs
-    ]
-    again = known(place_models(models)[0][1])
+    estimates = [known(verdict.estimate) for verdict in verdicts]
+    pairs = zip(rough.parts, estimates, strict=True)
+    pieces = [Piece(part.trajectory, each, False, each.metric_from_sfm) for part, each in pairs]
+    again = place_pieces(dict(enumerate(pieces)))[0][1]
     assert again.scale == pytest.approx(known(verdicts[1].joined_from_sfm).scale, rel=1e-6)
+
+
+def test_an_anchor_that_was_moved_between_the_halves_is_named_and_moves_neither(exact: Halves) -> None:
+    of_both, there = exact.log, walk(ANCHORS_M | {"A2": (6.0, -3.0, 2.0)}).log
+    log = replace(of_both, range_m=np.where(of_half(exact, 1), there.range_m, of_both.range_m))
+    path, _, warnings = replace(exact, log=log).with_ranges(np.ones(len(log), dtype=bool)).join("unknown")
+    (warning,) = warnings
+    assert re.fullmatch(r"anchor A2 is (1\.\d|2\.1) m elsewhere by another model", warning)
+    assert exact.off_m(path.trajectory.centers) < 1e-6
 
 
 def test_a_half_that_shares_too_few_anchors_is_left_out_and_nothing_invented(exact: Halves) -> None:
@@ -195,20 +210,26 @@ def test_a_half_without_ranges_is_left_out_and_one_that_others_join_must_have_so
         exact.with_ranges(of_half(exact, 1)).join("unknown")
 
 
+def photographed(halves: Halves, folder: Path) -> Survey:
+    """Write the halves with photos that nobody reads, and return their survey."""
+    (folder / "photos").mkdir()
+    for part in halves.parts:
+        for name in part.trajectory.image_names:
+            (folder / "photos" / name).touch()
+    return halves.write(folder).changed({"images.path": folder / "photos"})
+
+
 def test_a_run_joins_what_the_mapper_left_in_pieces(
     exact: Halves, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = [name for part in exact.parts for name in part.trajectory.image_names]
-    (tmp_path / "photos").mkdir()
-    for name in names:
-        (tmp_path / "photos" / name).touch()
     models = tuple(part.sfm for part in exact.parts)
 
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
         return ReconstructionSummary(models, {}, {}, tmp_path / "mapper.log")
 
     monkeypatch.setattr("rangesfm.pipeline.map_photos.reconstruct_in", reconstruct)
-    survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
+    survey = photographed(exact, tmp_path)
     result = run_survey(survey, progress=Progress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
     assert path.image_names == tuple(names)
@@ -225,6 +246,33 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
         at = motion.similarity.apply(part.trajectory.centers[0])
         assert at == pytest.approx(path.centers[first], abs=1e-6)
     assert result.metric_from_sfm.scale == pytest.approx(known(result.models[0].metric_from_sfm).scale)
+
+
+def test_a_run_joins_models_that_positions_have_placed(
+    exact: Halves, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without any range, and with a clock that has to be found."""
+    models, times = tuple(part.sfm for part in exact.parts), np.arange(100.4, 99.0 + NUM_PHOTOS, 0.5)
+    monkeypatch.setattr(
+        "rangesfm.pipeline.map_photos.reconstruct_in",
+        lambda *_, **__: ReconstructionSummary(models, {}, {}, tmp_path / "mapper.log"),
+    )
+    at_m = walked().centers(times) + walked().world_from_cam(times) @ TAG_IN_CAM_M
+    rows = (f"{t + 7.0},{x},{y},{z}" for t, (x, y, z) in zip(times.tolist(), at_m.tolist(), strict=True))
+    (tmp_path / "positions.csv").write_text("\n".join(["timestamp_s,x_m,y_m,z_m", *rows]))
+    survey = photographed(exact, tmp_path).changed(
+        {
+            "ranges.path": None,
+            "ranges.time_offset": None,
+            "tag.tag_in_cam_m": None,
+            "positions.path": tmp_path / "positions.csv",
+            "positions.antenna_in_cam_m": TAG_IN_CAM_M,
+        }
+    )
+    result = run_survey(survey, progress=Progress()).summary
+    assert [model.joined for model in result.models] == [True, True]
+    path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))
+    assert exact.off_m(path.centers, with_scale=False) < 0.05
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,8 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.transform import joined_model, rescale
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.model_placement import ScaledModel, place_models
+from rangesfm.estimation.scale.model_placement import Piece, place_pieces
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.locate_lengths import distances_within, locatable
 from rangesfm.measurements.ranges.range_observations import each_on_one_path, joined_observations
 from rangesfm.pipeline.close_loops import loop_matching
@@ -63,30 +64,28 @@ def join_models(
     exclusive = each_on_one_path([part.observations for part in parts])
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
     first = _first_in_time(parts)
-    scaled: dict[int, ScaledModel] = {}
+    is_given = run.inputs.anchor_frame == "first_camera"
+    estimates: dict[int, ScaleEstimate] = {}
     reasons: dict[int, str] = {}  # why the own ranges of a model do not determine its scale, or why it is not placed
     for k, part in enumerate(parts):
         try:
-            scaled[k] = scaled_alone(run, part, has_first_camera=k == first)
+            estimates[k] = scaled_alone(run, part, has_first_camera=k == first)
         except GeometryError as error:
             if k == 0:
                 raise
             reasons[k] = str(error)
-    places, why_not, notes = place_models(list(scaled.values()))
-    reasons |= {k: reason for k, reason in zip(scaled, why_not, strict=True) if reason}
-    if first in reasons and run.inputs.anchor_frame == "first_camera":
+    pieces = {
+        k: Piece(parts[k].trajectory, each, each.frame == "site" or (is_given and k == first), each.metric_from_sfm)
+        for k, each in estimates.items()
+    }
+    placed, not_placed, notes = place_pieces(pieces)
+    reasons |= not_placed
+    if first in reasons and is_given:
         why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has that photo, "
         reasons = {k: reasons.get(k, f"{why}cannot be placed") for k in range(1, len(parts))}
-    first_from_sfm = dict(zip(scaled, places, strict=True))
-    placed = {k: motion for k, motion in first_from_sfm.items() if motion is not None and k not in reasons}
+    placed = {k: placed[k] for k in sorted(placed.keys() - reasons.keys())}
     verdicts = tuple(
-        ModelVerdict(
-            part.name,
-            part.sfm.num_reg_images(),
-            scaled[k].estimate if k in scaled else None,
-            placed.get(k),
-            reasons.get(k, ""),
-        )
+        ModelVerdict(part.name, part.sfm.num_reg_images(), estimates.get(k), placed.get(k), reasons.get(k, ""))
         for k, part in enumerate(parts)
     )
     left_out = [model for model in verdicts if model.joined_from_sfm is None]
@@ -107,8 +106,8 @@ def _first_in_time(parts: Sequence[PathOfModel]) -> int:
     return starts.index(min(starts))
 
 
-def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaledModel:
-    """Scale a model by its own ranges.
+def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaleEstimate:
+    """Scale a model by all that is measured in it.
 
     For a model without the first photo, anchors in that photo's frame are like anchors in a site frame.
     """
@@ -118,11 +117,7 @@ def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -
         run = run.changed({"scale.up_in_first_camera": None})
     tape = distances_within(locatable(run.inputs.tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
     run = replace(run, inputs=replace(run.inputs, anchor_frame=frame, tape=tape))
-    estimate = run.estimate_scale(part, part.as_walk)
-    is_given = frame == "first_camera"
-    return ScaledModel(
-        part.trajectory, estimate, is_in_anchor_frame=is_given or estimate.frame == "site", frame_is_given=is_given
-    )
+    return run.estimate_scale(part, part.as_walk)
 
 
 def assembled(
@@ -258,7 +253,7 @@ def _scale_alone(run: SurveyRun, first: PathOfModel, second: PathOfModel, tie: T
     """
     for path, units in ((first, 1.0), (second, tie.first_from_second.scale)):
         try:
-            estimate = scaled_alone(run, path, has_first_camera=False).estimate
+            estimate = scaled_alone(run, path, has_first_camera=False)
         except GeometryError:
             continue
         return estimate.value / units, float(np.nanmedian(estimate.errors.stddev_m))

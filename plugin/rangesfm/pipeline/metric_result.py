@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -194,12 +193,14 @@ class MetricResult:
             refined = replace(
                 refined,
                 model=rescale(refined.model, shift),
-                summary=refined.summary.with_anchors(_moved_anchors(refined.summary.ranges.anchors, offset_m)),
+                summary=refined.summary.with_anchors(
+                    tuple(each.moved(shift) for each in refined.summary.ranges.anchors)
+                ),
                 loops=refined.loops and refined.loops.moved(offset_m),
             )
         return replace(
             self,
-            estimate=moved.with_anchors(_moved_anchors(estimate.anchors, offset_m)),
+            estimate=moved.with_anchors(tuple(each.moved(shift) for each in estimate.anchors)),
             scaled=rescale(self.scaled, shift),
             inputs=replace(self.inputs, positions=self.inputs.positions.moved(offset_m)),
             refined=refined,
@@ -215,12 +216,3 @@ class MetricResult:
         advice = (*(doubt.advice for doubt in doubts if doubt.advice), *estimate.advice)
         doubted = replace(estimate, verdict="doubtful", reasons=reasons, advice=tuple(dict.fromkeys(advice)))
         return replace(self, estimate=doubted)
-
-
-def _moved_anchors(anchors: Sequence[AnchorEstimate], offset_m: Array) -> tuple[AnchorEstimate, ...]:
-    names = ("position_m", "prior_position_m", "mirror_position_m")
-    places = [{name: at for name in names if (at := getattr(anchor, name)) is not None} for anchor in anchors]
-    return tuple(
-        replace(anchor, **{name: at + offset_m for name, at in of_anchor.items()})
-        for anchor, of_anchor in zip(anchors, places, strict=True)
-    )

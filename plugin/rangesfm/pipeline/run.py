@@ -159,8 +159,9 @@ def map_in_metres(
         metres. If a mistake was adopted, its inputs are corrected.
     """
     with run.journal.stage("scale"):
+        run = _with_clocks(run, paths[0].trajectory)  # where another model is joined may depend on the clocks
         path, verdicts = join_models(run, paths, must_join=must_join)
-        run = _in_map(_with_clocks(run, path.trajectory), path.sfm)
+        run = _in_map(run, path.sfm)
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.model_placement import PlacedAnchor, align_by_anchors
-from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.estimation.scale.model_placement import align_by_anchors
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 
 Array = npt.NDArray[np.float64]
 
@@ -19,9 +22,12 @@ PLACES_M = {"A": (6.0, 0, 2.5), "B": (-6.0, 1, 0.4), "C": (0.5, 6, 3), "D": (1.0
 SMALL = 1e-4 * np.eye(3)
 
 
-def anchors(ids: str, into: Similarity | None = None, covariance_m2: Array = SMALL) -> dict[str, PlacedAnchor]:
-    placed = {id_: PlacedAnchor(np.array([PLACES_M[id_]]), covariance_m2) for id_ in ids}
-    return placed if into is None else {id_: anchor.moved(into) for id_, anchor in placed.items()}
+def anchor(id_: str, place_m: Array, covariance_m2: Array = SMALL) -> AnchorEstimate:
+    return AnchorEstimate(id_, place_m, 0.01, None, np.inf, 0.0, 0.0, 0.0, position_covariance_m2=covariance_m2)
+
+
+def anchors(ids: str, into: Similarity = IDENTITY, covariance_m2: Array = SMALL) -> dict[str, AnchorEstimate]:
+    return {id_: anchor(id_, np.array(PLACES_M[id_]), covariance_m2).moved(into) for id_ in ids}
 
 
 def off_m(found: Similarity) -> float:
@@ -39,7 +45,7 @@ def test_three_anchors_not_on_a_line_fix_the_motion(ids: str) -> None:
 
 def test_an_anchor_that_was_moved_in_between_is_named_and_has_no_say() -> None:
     source = anchors("ABCDE")
-    source["D"] = PlacedAnchor(source["D"].places_m + np.array([0.0, 0.0, 2.0]), SMALL)
+    source["D"] = anchor("D", source["D"].position_m + np.array([0.0, 0.0, 2.0]))
     found = align_by_anchors(anchors("ABCDE", MOTION), source, PATH_M)[0]
     assert off_m(found.target_from_source) < 0.02
     assert found.elsewhere_m.keys() == {"D"}
@@ -49,12 +55,11 @@ def test_an_anchor_that_was_moved_in_between_is_named_and_has_no_say() -> None:
 def test_of_mirror_places_those_are_chosen_that_fit() -> None:
     source = anchors("ABCDE")
     for id_ in "ABD":
-        place = source[id_].places_m[0]
-        mirror = place * [1.0, 1.0, -1.0]
-        source[id_] = PlacedAnchor(np.array([mirror, place]), SMALL)
+        place = source[id_].position_m
+        source[id_] = replace(anchor(id_, place * [1.0, 1.0, -1.0]), mirror_position_m=place)
     found = align_by_anchors(anchors("ABCDE", MOTION), source, PATH_M)[0]
     assert off_m(found.target_from_source) < 1e-9
-    assert {id_: side for id_, (_, side) in found.sides.items()} == {"A": 1, "B": 1, "C": 0, "D": 1, "E": 0}
+    assert dict(zip(found.ids, found.sides[1], strict=True)) == {"A": 1, "B": 1, "C": 0, "D": 1, "E": 0}
 
 
 def test_an_anchor_counts_in_the_directions_in_which_its_place_is_known() -> None:
@@ -62,11 +67,11 @@ def test_an_anchor_counts_in_the_directions_in_which_its_place_is_known() -> Non
     tall = np.diag([1e-4, 1e-4, 4.0])
     source = anchors("ABCDE", covariance_m2=tall)
     for id_, height in zip("ABC", (2.0, -2.0, 1.5), strict=True):
-        source[id_] = PlacedAnchor(source[id_].places_m + np.array([0.0, 0.0, height]), tall)
+        source[id_] = anchor(id_, source[id_].position_m + np.array([0.0, 0.0, height]), tall)
     source["D"], source["E"] = anchors("DE").values()
     target = anchors("ABCDE", MOTION)
     found = align_by_anchors(target, source, PATH_M)[0]
-    without = align_by_anchors(target, {id_: PlacedAnchor(a.places_m, SMALL) for id_, a in source.items()}, PATH_M)[0]
+    without = align_by_anchors(target, {id_: anchor(id_, each.position_m) for id_, each in source.items()}, PATH_M)[0]
     assert off_m(found.target_from_source) < 0.6 < off_m(without.target_from_source)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.util.geometry.similarity import Similarity
@@ -42,7 +44,8 @@ class AnchorEstimate:
         prior_bias_m, prior_bias_stddev_m: prior of the bias, without the part that all anchors share; a standard
             deviation of 0 fixes it.
         mirror_position_m: mirror image that fits as well; None if there is none.
-        position_covariance_m2: (3, 3) covariance by the ranges alone, before any refinement; None if unknown.
+        position_covariance_m2: (3, 3) covariance by the ranges alone, before any refinement; 0 for an anchor that was
+            held fixed.
     """
 
     anchor_id: str
@@ -54,7 +57,18 @@ class AnchorEstimate:
     prior_bias_m: float
     prior_bias_stddev_m: float
     mirror_position_m: Array | None = None
-    position_covariance_m2: Array | None = None
+    position_covariance_m2: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def moved(self, motion: Similarity) -> AnchorEstimate:
+        """Return it carried into another frame by a rigid motion."""
+        prior_m, mirror_m, turn = self.prior_position_m, self.mirror_position_m, motion.rotation
+        return replace(
+            self,
+            position_m=motion.apply(self.position_m),
+            prior_position_m=None if prior_m is None else motion.apply(prior_m),
+            mirror_position_m=None if mirror_m is None else motion.apply(mirror_m),
+            position_covariance_m2=turn @ self.position_covariance_m2 @ turn.T,
+        )
 
     def mirror_moved(self, change: Similarity) -> AnchorEstimate:
         """Return it with its mirror image, if there is one, where a similarity moves that."""
