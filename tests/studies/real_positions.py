@@ -93,8 +93,9 @@ def main() -> int:
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(at_m.shape)
         log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), ByTime(at_s), np.arange(len(at_s)))
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
-        known = locate_antenna(find_antenna_offset(track, path), path)
-        found = scale_by_positions(PositionScale.begun(known, path, bending))
+        timed = find_antenna_offset(track, path)
+        known = locate_antenna(timed, path)
+        found = scale_by_positions(PositionScale.begun(known, path, bending, SurveyedPositions(antenna=timed)))
         told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)
         if seed < asked.num_refined:
             told("refined", *refined(whole, track))

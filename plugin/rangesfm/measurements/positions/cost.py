@@ -92,7 +92,7 @@ class AntennaPositions(Measurements):
             of_camera.on_map(at.trajectory, arms_in_cam_m, known.arms_m[rows], site_from_model),
             known.position_m[rows],
             _whitenings(known.covariance_m2[rows], stddev_m),
-            stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / stddev_m, 0.0),
+            stated_share=np.nan_to_num(stated_m) / stddev_m,
             group=stretch_labels(known.time_s[rows], STRETCH_S),
             arm_m=arm_m,
             arm_stddev_m=at.options.lever_arm_stddev_m,

@@ -35,13 +35,10 @@ class KnownPositions:
         is_mark: (k,) whether it is a mark; otherwise it is the antenna.
         is_check: (k,) positions that do not take part in the estimate.
         position_m: (k, 3) in the site. covariance_m2: (k, 3, 3) of these; NaN where it is unknown.
-        is_stated: (k,) whether the covariance was given with the position, and not assumed.
-        is_geodetic: (k,) whether it was given in a coordinate system of the Earth, whose scale is right.
         places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
         own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
         arm_stddev_m: (k,) of each coordinate of the arms.
         time_s: (k,) on the photos' clock, or the number of the photo where these have no times; NaN for marks.
-        clock_stddev_s: (k,) of the time offset that all share.
         velocity: (k, 3) of the antenna, model units per second; 0 for marks.
         world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
         by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
@@ -54,14 +51,11 @@ class KnownPositions:
     is_check: Mask
     position_m: Array
     covariance_m2: Array
-    is_stated: Mask
-    is_geodetic: Mask
     places: Array
     arms_m: Array
     own_covariance: Array
     arm_stddev_m: Array
     time_s: Array
-    clock_stddev_s: Array
     velocity: Array
     world_from_cam: Array
     by_pose: csr_array

@@ -8,7 +8,7 @@ of these that last for some time or belong to a place (section 4 of ``model.md``
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS, KnownPositions
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.noise import Component, independent_unknowns
@@ -150,7 +151,7 @@ def grouped_by_time(known: KnownPositions, weights: Array, max_num: int) -> csr_
 
 
 def _alone(
-    known: KnownPositions, similarity: Similarity, grouping: csr_array, stddev_m: Array, lasting_s: Sequence[float]
+    known: KnownPositions, similarity: Similarity, grouping: csr_array, stddev_m: Array, surveyed: SurveyedPositions
 ) -> Iterator[Component]:
     """Yield the components of the errors without that of the frame; arguments as for ``components_of``."""
     rotation = similarity.rotation
@@ -164,17 +165,16 @@ def _alone(
         yield Component(names_of_place, _covariance_of_groups(grouping, places, of_kind))
         is_known = bool(np.isfinite(covariance[of_kind]).all())
         own = _covariance_of_groups(grouping, covariance if is_known else assumed, of_kind)
-        spread = 0.0 if known.is_stated[of_kind].all() and name == "points" else _SPREAD_GIVEN
+        spread = 0.0 if surveyed.points.stddevs_are_given and name == "points" else _SPREAD_GIVEN
         yield Component(name, own, spread=spread if is_known else _SPREAD_GUESSED)
-    if known.clock_stddev_s.any():
-        moved_m = similarity.scale * known.velocity @ rotation.T * known.clock_stddev_s[:, None]
-        of_clock = grouping @ moved_m.ravel()
+    if surveyed.clock_stddev_s and known.velocity.any():
+        of_clock = surveyed.clock_stddev_s * (grouping @ (similarity.scale * known.velocity @ rotation.T).ravel())
         yield Component(CLOCKS, np.outer(of_clock, of_clock))
     if not (rows := np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))).size:
         return
     size_m = np.where(np.isfinite(stddev_of(covariance)), stddev_of(covariance), stddev_m)
     of_groups, times_s = _times_of_groups(grouping, known, size_m, rows)
-    for within_s in lasting_s:
+    for within_s in surveyed.lasting_s:
         apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / within_s)
         alike = apart.reshape(len(times_s), _NUM_WITHIN, -1, _NUM_WITHIN).mean(axis=(1, 3))
         own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
@@ -190,7 +190,7 @@ def components_of(
     similarity: Similarity,
     grouping: csr_array,
     stddev_m: Array,
-    lasting_s: Sequence[float],
+    surveyed: SurveyedPositions,
     design: Array,
     used: Mask,
 ) -> tuple[Component, ...]:
@@ -202,15 +202,14 @@ def components_of(
 
     Args:
         grouping: (3 g, 3 k) as of ``GroupedPositions``. stddev_m: (k,) of a coordinate, where none is given.
-        lasting_s: for how long errors of an antenna last. design: (3 g, 7) derivatives. used: (3 g,) that take part.
+        surveyed: what the positions were given as. design: (3 g, 7) derivatives. used: (3 g,) that take part.
     """
-    components = tuple(_alone(known, similarity, grouping, stddev_m, lasting_s))
+    components = tuple(_alone(known, similarity, grouping, stddev_m, surveyed))
     off_middle = _off_middle(known, similarity, grouping)
     if off_middle is None or not used.any():
         return components
     _, has_frame, from_middle, extent_m = off_middle
-    is_geodetic = known.is_geodetic[~known.is_mark & np.isfinite(known.time_s)].all()
-    stretch = (0.0 if is_geodetic else 1.0) / extent_m * from_middle.ravel()
+    stretch = (0.0 if surveyed.is_geodetic else 1.0) / extent_m * from_middle.ravel()
     frame = np.kron(np.outer(has_frame, has_frame), np.eye(3)) + np.outer(stretch, stretch)
     taken_up, _ = independent_unknowns(design[used], np.zeros((0, design.shape[1])))
 

@@ -215,7 +215,6 @@ class PositionScale(KindOnMap):
         design = grouping @ design_of_positions(known, similarity, self.path)
         variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
         weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
-        lasting_s = self.surveyed.lasting_s
         nothing = np.zeros(0, dtype=np.int64)
         return GroupedPositions(
             kind=POSITIONS,
@@ -223,7 +222,7 @@ class PositionScale(KindOnMap):
             design=design,
             residual_m=grouping @ known.misclosures_m(similarity).ravel(),
             by_pose=by_pose,
-            components=components_of(known, similarity, grouping, self.stddev_m, lasting_s, design, used),
+            components=components_of(known, similarity, grouping, self.stddev_m, self.surveyed, design, used),
             alone_m2=weighed,
             is_used=used,
             grouping=grouping,
@@ -386,9 +385,7 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
     Args:
         on_map: all that is measured in the map. against: tests that compare the positions with other kinds.
     """
-    # The step to the estimate may turn a map about a straight path so far that points beside it do not move linearly.
-    delivered = on_map.rejoined([each.moved(on_map.posterior) for each in on_map.kinds], on_map.estimate)
-    of_points, of_antenna = _of_points(positions, delivered), [*_of_antenna(positions, on_map)]
+    of_points, of_antenna = _of_points(positions, on_map), [*_of_antenna(positions, on_map)]
     likely = sorted((row for row in of_antenna if row.rejected), key=lambda row: -row.statistic)[:1]
     reasons = []
     for alike in (*of_points, *([row] for row in likely)):
@@ -411,8 +408,12 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
     the mistakes that are likelier, as all explain each other's residuals in part. Control points of which either may be
     wrong are in one group.
     """
-    known, problem = positions.known, on_map.problem
-    marks = np.flatnonzero(known.is_mark).tolist()
+    known = positions.known
+    if not (marks := np.flatnonzero(known.is_mark).tolist()):
+        return []
+    # The step to the estimate may turn a map about a straight path so far that points beside it do not move linearly.
+    on_map = on_map.rejoined([each.moved(on_map.posterior) for each in on_map.kinds], on_map.estimate)
+    problem = on_map.problem
     columns = {known.names[row]: positions.columns_of(on_map, at_point(known, row)) for row in marks}
     controls = {known.names[row] for row in marks if positions.is_kept[row]}
     left_out = [name for name in columns if name in positions.names_left_out]
@@ -422,7 +423,7 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
         left.append(_OF_ALL)
     rows = np.any(np.hstack([problem.is_used[:, None], *columns.values()]), axis=1)
     (linear, noise), gains = problem.among(rows), on_map.posterior.gains
-    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(columns), 1)))
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / len(columns)))
 
     def tested(some: Sequence[str], beside: Sequence[str]) -> list[MistakeTest]:
         others = linear.with_more([columns[name][rows] for name in beside]).solved(noise.covariance_m2)
@@ -469,7 +470,7 @@ def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeT
         return
     shown = is_antenna[:, None, None]
     columns = {_ARM: np.where(shown, rotation @ known.world_from_cam, 0.0)}
-    if known.velocity.any() and not known.clock_stddev_s.any():  # an offset that was searched for has no mistake
+    if known.velocity.any() and not positions.surveyed.clock_stddev_s:  # an offset that was searched for has no mistake
         moves = placed.scale * known.velocity @ rotation.T
         columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
     if (known.is_mark & positions.used).sum() >= MIN_NUM_POSITIONS:

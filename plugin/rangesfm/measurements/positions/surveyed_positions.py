@@ -63,6 +63,16 @@ class SurveyedPositions:
         """True if the photos' times are needed."""
         return self.antenna is not None and isinstance(self.antenna.log.moments, ByTime)
 
+    @property
+    def clock_stddev_s(self) -> float:
+        """Standard deviation of the time offset that all positions of the antenna share; 0 where it was given."""
+        return 0.0 if self.antenna is None else self.antenna.offset_stddev_s
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether those of the antenna are in a coordinate system of the Earth, whose scale is right."""
+        return self.antenna is not None and bool(self.antenna.log.crs)
+
     def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
         """Find the positions that are in a model. Those by a wrong clock are left out.
 
