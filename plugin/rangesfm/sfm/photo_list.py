@@ -15,10 +15,8 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_range, is_rising, named_photos
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import (
-    Choice,
     TableForm,
     UnclearListError,
-    columns_flag,
     times_by_row,
 )
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
@@ -79,8 +77,7 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         return {"image_name": photos[0].name, **guess.columns}
     choices = []
     for one in photos:
-        columns = {"image_name": one.name, **guess.columns}
-        choices.append(Choice(f"if {one.name} is the photo", columns_flag("image_times_columns", columns)))
+        choices.append(PHOTO_TIMES.choice(f"if {one.name} is the photo", {"image_name": one.name, **guess.columns}))
     raise UnclearListError(PHOTO_TIMES.what, path, layout, doubts, choices)
 
 
@@ -89,6 +86,7 @@ PHOTO_TIMES = TableForm(
     {"image_name": "image_name", "timestamp": "timestamp_s"},
     ("image_name", "timestamp"),
     find_photo_columns,
+    "image_times_columns",
     also=("date", "nanoseconds"),
 )
 

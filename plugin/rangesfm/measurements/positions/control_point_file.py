@@ -84,6 +84,7 @@ POINTS = TableForm(
     {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"},
     ("marker", *AXES),
     _find_columns,
+    "point_columns",
 )
 
 

@@ -20,16 +20,13 @@ from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, ar
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
     Choice,
+    TableForm,
     UnclearListError,
-    columns_flag,
     coordinates_of_point,
 )
 
 STDDEVS = tuple(f"stddev_{axis}" for axis in AXES)
 COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-QUANTITIES = (
-    *("timestamp", "date", "nanoseconds", "image_name", *AXES, "stddev", *STDDEVS, *COVARIANCES, "tag_id", "quality"),
-)
 _KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
 
@@ -56,8 +53,24 @@ def find_position_columns(path: Path, layout: Layout) -> dict[str, str]:
         guess.doubts.insert(0, "no column seems to be the time or the photo")
     _add_errors(free, guess.columns)
     if guess.doubts:
-        raise UnclearListError("positions", path, layout, guess.doubts, [*_choices(free, guess.columns, axes)])
+        raise UnclearListError(POSITIONS.what, path, layout, guess.doubts, [*_choices(free, guess.columns, axes)])
     return guess.columns
+
+
+POSITIONS = TableForm(
+    "positions",
+    {
+        "timestamp": "timestamp_s",
+        "image_name": "image_name",
+        **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
+        **{name: f"{name}_m2" for name in COVARIANCES},
+        "quality": "quality",
+    },
+    ("timestamp or image_name", *AXES),
+    find_position_columns,
+    "position_columns",
+    also=("date", "nanoseconds", "tag_id"),
+)
 
 
 def is_degrees(name: str, axis: str) -> bool:
@@ -165,15 +178,10 @@ def _choices(
     for (is_key, key), (are_axes, place) in islice(ways, _MAX_NUM_WAYS):
         taken = {**columns, **key, **place}
         if len({*taken.values()}) == len(taken):
-            yield _choice(" and ".join(filter(None, (is_key, are_axes))), taken)
+            yield POSITIONS.choice(f"if {' and '.join(filter(None, (is_key, are_axes)))}", taken)
     if not ways:
         unknown = {key: "NAME" for key in (*(() if has_key else ("timestamp",)), *AXES) if key not in columns}
-        yield _choice("with the names of the columns", {**columns, **unknown})
-
-
-def _choice(when: str, columns: Mapping[str, str]) -> Choice:
-    ordered = {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
-    return Choice(when if when.startswith("with") else f"if {when}", columns_flag("position_columns", ordered))
+        yield POSITIONS.choice("with the names of the columns", {**columns, **unknown})
 
 
 def _possible_keys(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str, str]]]:

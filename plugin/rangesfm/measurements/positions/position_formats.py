@@ -19,15 +19,15 @@ from rangesfm.errors import InputError, nearest_known, printable
 from rangesfm.measurements.positions.pose_priors import is_database, read_pose_priors
 from rangesfm.measurements.positions.position_columns import (
     COVARIANCES,
+    POSITIONS,
     STDDEVS,
-    find_position_columns,
     is_degrees,
 )
 from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.layout import MISSING
-from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, metres, times_by_row
+from rangesfm.measurements.ranges.readers.lists import AXES, metres, times_by_row
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, PositionOptions
 from rangesfm.util.files.text_tables import (
@@ -41,19 +41,6 @@ from rangesfm.util.files.text_tables import (
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
 
-_POSITIONS = TableForm(
-    "positions",
-    {
-        "timestamp": "timestamp_s",
-        "image_name": "image_name",
-        **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
-        **{name: f"{name}_m2" for name in COVARIANCES},
-        "quality": "quality",
-    },
-    ("timestamp or image_name", *AXES),
-    find_position_columns,
-    also=("date", "nanoseconds", "tag_id"),
-)
 DEGREES = Bounds(-360, 360, "degrees")
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
 _SECONDS_OF_DAY = 86400.0
@@ -96,8 +83,8 @@ def is_of_positions(head: str) -> bool:
 
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
     given = options.columns or options.unit or options.timestamp_unit
-    unit = "s" if not given and _POSITIONS.is_canonical(read_head(path)) else options.timestamp_unit
-    return _log_of_table(_POSITIONS.read(path, options.columns, options.unit, every_row=False), options, unit)
+    unit = "s" if not given and POSITIONS.is_canonical(read_head(path)) else options.timestamp_unit
+    return _log_of_table(POSITIONS.read(path, options.columns, options.unit, every_row=False), options, unit)
 
 
 def _log_of_table(
@@ -107,7 +94,7 @@ def _log_of_table(
     table = replace(table, missing=MISSING)
     notes, crs = [*table.notes], crs_in_head(read_head(table.path))
     if "timestamp" in table:
-        times_s, _, more = times_by_row(table, _POSITIONS.what, time_unit, "--position_time_unit")
+        times_s, _, more = times_by_row(table, POSITIONS.what, time_unit, "--position_time_unit")
         moments: Moments = ByTime(times_s)
         notes += more
     else:
@@ -389,6 +376,6 @@ POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "odm": (_is_odm, _read_odm),
     "tum": (_is_tum, _read_tum),
     "marvelmind": (_is_marvelmind, _read_marvelmind),
-    "table": (_POSITIONS.is_canonical, _read_table),
+    "table": (POSITIONS.is_canonical, _read_table),
 }
 """Formats by name: whether a file begins like one, and its reader."""

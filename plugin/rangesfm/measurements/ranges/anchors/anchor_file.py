@@ -17,7 +17,6 @@ from rangesfm.measurements.ranges.readers.lists import (
     Choice,
     TableForm,
     UnclearListError,
-    columns_flag,
     coordinates_of_point,
     metres,
     ways_to_complete,
@@ -107,13 +106,13 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         several = found[quantity]
         if len(several) > 1:
             doubts.append(f"any of {_listed(several)} may be {what}")
-            choices += [_choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
+            choices += [ANCHORS.choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
         elif not several and not degrees:
             doubts.append(f"no column seems to be {what}")
     if not doubts and degrees:
         named = columns | degrees
         doubts.append(f"{degrees['y']} and {degrees['x']} are degrees, of no known coordinate system")
-        choices = [_choice("if that is WGS 84", named, "--anchor_crs", _GEOGRAPHIC)] if "z" in named else []
+        choices = [ANCHORS.choice("if that is WGS 84", named, "--anchor_crs", _GEOGRAPHIC)] if "z" in named else []
     elif not doubts:
         for doubt, those in _doubts_about_axes(layout, columns):
             doubts.append(doubt)
@@ -121,9 +120,9 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     if not doubts:
         return columns
     if not choices and not degrees:
-        choices = [_choice(when, ways) for when, ways in ways_to_complete(columns, _candidates(layout, columns))]
+        choices = [ANCHORS.choice(when, ways) for when, ways in ways_to_complete(columns, _candidates(layout, columns))]
     unknown = {quantity: "NAME" for quantity in ("anchor_id", *AXES) if quantity not in columns | degrees}
-    choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
+    choices = choices or [ANCHORS.choice("with the names of the columns", columns | degrees | unknown)]
     raise UnclearListError(WHAT, path, layout, doubts, choices)
 
 
@@ -140,6 +139,7 @@ ANCHORS = TableForm(
     {quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES},
     ("anchor_id", *AXES),
     find_or_ask,
+    "anchor_columns",
     aliases={"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"},
 )
 
@@ -156,15 +156,10 @@ def like_anchors(path: Path) -> UnclearListError | None:
         return None
     ways = [dict(zip(AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
     choices = [
-        _choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
+        ANCHORS.choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
         for way in ways
     ]
     return UnclearListError(WHAT, path, layout, ["the names of the columns are not known"], choices)
-
-
-def _choice(when: str, columns: Mapping[str, str], *flags: str) -> Choice:
-    ordered = {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
-    return Choice(when, (*columns_flag("anchor_columns", ordered), *flags))
 
 
 def _candidates(layout: Layout, columns: Mapping[str, str]) -> dict[str, list[str]]:
@@ -260,16 +255,19 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
         if largest > LOCAL_M or len(order) > 4:
-            first = _choice("if the numbers are x, y, z or east, north, height", columns)
-            second = _choice("if they are north, east, height (PNEZD)", swapped)
+            first = ANCHORS.choice("if the numbers are x, y, z or east, north, height", columns)
+            second = ANCHORS.choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]
     elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
-        choices = [_choice(f"if {x} is north", swapped), _choice(f"if {x} is east and {y} is north", columns)]
+        choices = [
+            ANCHORS.choice(f"if {x} is north", swapped),
+            ANCHORS.choice(f"if {x} is east and {y} is north", columns),
+        ]
         yield f"{y} comes before {x}, as where surveyors call north x", choices
     units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
     if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})
-        choices = [_choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
+        choices = [ANCHORS.choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
         yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices
 
 

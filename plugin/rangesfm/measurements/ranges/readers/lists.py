@@ -93,11 +93,6 @@ def _renamed(text: str, quantities: Mapping[str, str], flags: Mapping[str, str])
     return text
 
 
-def columns_flag(flag: str, columns: Mapping[str, str]) -> tuple[str, str]:
-    """Return a flag with columns by quantity as the user types them."""
-    return f"--{flag}", ",".join(f"{quantity}={name}" for quantity, name in columns.items())
-
-
 def ways_to_complete(
     columns: Mapping[str, str], candidates: Mapping[str, Sequence[str]]
 ) -> Iterator[tuple[str, dict[str, str]]]:
@@ -134,6 +129,7 @@ class TableForm:
         names: name of the column of each quantity in the canonical CSV. Those of lengths end in ``_m``.
         required: quantities that it must have, such as "x", or "timestamp or image_name" of which one is enough.
         find: returns the name of the column of each quantity in another table, or None if it is no such table.
+        flag: by which the user gives the columns; empty if one cannot.
         also: quantities that only other tables have.
         aliases: other names of columns in the canonical CSV, as for ``read_table``.
     """
@@ -142,6 +138,7 @@ class TableForm:
     names: Mapping[str, str]
     required: Sequence[str]
     find: Callable[[Path, Layout], Mapping[str, str] | None]
+    flag: str = ""
     also: Sequence[str] = ()
     aliases: Mapping[str, str] = field(default_factory=dict)
 
@@ -150,6 +147,16 @@ class TableForm:
         """The columns of a canonical CSV, in each way to choose them."""
         each = (quantity.split(" or ") for quantity in self.required)
         return [[self.names[quantity] for quantity in way] for way in product(*each)]
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """All quantities that such a table may have."""
+        return (*self.names, *self.also)
+
+    def choice(self, when: str, columns: Mapping[str, str], *flags: str) -> Choice:
+        """Return a way to read a table, by the columns of quantities and further flags."""
+        typed = ",".join(f"{quantity}={columns[quantity]}" for quantity in self.quantities if quantity in columns)
+        return Choice(when, (f"--{self.flag}", typed, *flags))
 
     @property
     def expected(self) -> str:
@@ -226,7 +233,7 @@ class TableForm:
         Raises:
             InputError: a quantity is unknown or missing, or the table has no such column.
         """
-        quantities = (*self.names, *self.also)
+        quantities = self.quantities
         for quantity, name in given.items():
             if quantity not in quantities:
                 message = f"quantity in columns is '{printable(quantity)}', expected one of {', '.join(quantities)}"
