@@ -209,7 +209,7 @@ class Piece:
     @property
     def is_placed(self) -> bool:
         """Whether it has its place in the site by more than ranges."""
-        by_others = any(each.places_map and not each.is_solved for each in self.estimate.kinds)
+        by_others = any(each.is_used and each.places_map and not each.is_solved for each in self.estimate.kinds)
         return self.in_site and (by_others or self.estimate.frame == "first_camera")
 
     @property
