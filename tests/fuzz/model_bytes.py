@@ -8,6 +8,8 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from tests.fuzz.mutation import mutated
+
 from rangesfm.colmap.model_files import NUM_CAMERA_PARAMS
 
 TEXT = "text"
@@ -70,9 +72,17 @@ def parse(name: str, data: bytes) -> ModelFile:
     return ModelFile(count, records, groups)
 
 
-def spoil(file: ModelFile, rng: random.Random) -> str:
-    """Make one change in place, and return its description."""
-    return rng.choice(_SPOILERS)(file, rng)
+def spoilt(name: str, data: bytes, rng: random.Random, max_size: int) -> bytes:
+    """Return a model file with up to four changes of its fields and records, or of its bytes, as ``mutated`` does."""
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        try:
+            file = parse(name, data)
+            rng.choice(_SPOILERS)(file, rng)
+            spoilt_data = file.pack()
+        except (struct.error, ValueError, IndexError, KeyError, OverflowError):  # an earlier change cannot be parsed
+            spoilt_data = mutated(data, rng, max_size)
+        data = spoilt_data if rng.random() < 0.8 else mutated(data, rng, max_size)
+    return data[:max_size]
 
 
 class _Cursor:
@@ -139,19 +149,21 @@ _PARSERS: dict[str, Callable[[_Cursor], _Record]] = {
 }
 
 
+PARSED = tuple(_PARSERS)
+
+
 def _any_fields(file: ModelFile, rng: random.Random) -> list[Field]:
     number = rng.randrange(len(file.records))
     choices = [file.records[number], *file.groups[number][:50]]
     return rng.choice(choices)
 
 
-def _set_extreme(file: ModelFile, rng: random.Random) -> str:
+def _set_extreme(file: ModelFile, rng: random.Random) -> None:
     field = rng.choice(_any_fields(file, rng))
     field.value = rng.choice(_EXTREMES[field.code])
-    return f"{field.name} = {field.value!r}"
 
 
-def _shift(file: ModelFile, rng: random.Random) -> str:
+def _shift(file: ModelFile, rng: random.Random) -> None:
     """Change a number by a little."""
     field = rng.choice(_any_fields(file, rng))
     if isinstance(field.value, bytes):
@@ -160,57 +172,47 @@ def _shift(file: ModelFile, rng: random.Random) -> str:
         field.value = field.value * rng.choice((-1.0, 1.001, 1e3, 1e-3))
     else:
         field.value = max(0, int(field.value) + rng.choice((-1, 1))) % 256
-    return f"{field.name} -> {field.value!r}"
 
 
-def _copy_from_another(file: ModelFile, rng: random.Random) -> str:
+def _copy_from_another(file: ModelFile, rng: random.Random) -> None:
     """Copy an id from another record, so that it occurs twice or refers to something else."""
     fields, others = _any_fields(file, rng), _any_fields(file, rng)
     same = [(field, other) for field in fields for other in others if field.name == other.name]
-    if not same:
-        return "nothing"
-    field, other = rng.choice(same)
-    field.value = other.value
-    return f"{field.name} as another's"
+    if same:
+        field, other = rng.choice(same)
+        field.value = other.value
 
 
-def _remove_record(file: ModelFile, rng: random.Random) -> str:
+def _remove_record(file: ModelFile, rng: random.Random) -> None:
     number = rng.randrange(len(file.records))
     del file.records[number], file.groups[number]
     file.count -= 1
-    return f"record {number} is gone"
 
 
-def _double_record(file: ModelFile, rng: random.Random) -> str:
+def _double_record(file: ModelFile, rng: random.Random) -> None:
     number = rng.randrange(len(file.records))
     file.records.append(file.records[number])
     file.groups.append(file.groups[number])
     file.count += 1
-    return f"record {number} twice"
 
 
-def _remove_groups(file: ModelFile, rng: random.Random) -> str:
+def _remove_groups(file: ModelFile, rng: random.Random) -> None:
     number = rng.randrange(len(file.records))
-    if not file.groups[number]:
-        return "nothing"
-    keep = rng.choice((0, 0, 1, len(file.groups[number]) - 1))
-    del file.groups[number][keep:]
-    announced = file.records[number][-1]
-    announced.value = keep
-    return f"{announced.name} = {keep}"
+    if file.groups[number]:
+        keep = rng.choice((0, 0, 1, len(file.groups[number]) - 1))
+        del file.groups[number][keep:]
+        file.records[number][-1].value = keep
 
 
-def _remove_all(file: ModelFile, rng: random.Random) -> str:
+def _remove_all(file: ModelFile, rng: random.Random) -> None:
     file.records, file.groups, file.count = [], [], 0
-    return "no records"
 
 
-def _lie_about_count(file: ModelFile, rng: random.Random) -> str:
+def _lie_about_count(file: ModelFile, rng: random.Random) -> None:
     file.count = rng.choice((0, 1, max(0, file.count - 1), file.count + 1, 2**31, 2**63, 2**64 - 1))
-    return f"count = {file.count}"
 
 
-_SPOILERS: tuple[Callable[[ModelFile, random.Random], str], ...] = (
+_SPOILERS: tuple[Callable[[ModelFile, random.Random], None], ...] = (
     *(_set_extreme, _set_extreme, _set_extreme, _shift, _shift, _copy_from_another, _copy_from_another),
     *(_remove_record, _double_record, _remove_groups, _remove_groups, _remove_all, _lie_about_count),
 )

@@ -22,7 +22,6 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz.mutation import mutated
 from tests.peak_memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -46,6 +45,7 @@ class Campaign:
         from tests.fuzz.targets import TARGETS
 
         self._target = next(target for target in TARGETS if target.name == name)
+        self.mutate = self._target.mutate
         self._output_path = output_path
         self._folder = tempfile.TemporaryDirectory(prefix="fuzz_")
         self._counts: Counter[str] = Counter()
@@ -94,7 +94,7 @@ def fuzz_one(name: str, runs: int, seed: int, output_path: Path) -> None:
         rng = random.Random(mutation_seed)
         if rng.random() < 0.3:
             return bytes(atheris.Mutate(data, max_size))
-        return mutated(data, rng, max_size)
+        return campaign.mutate(data, rng, max_size)
 
     corpus = output_path / "corpus"
     corpus.mkdir(exist_ok=True)

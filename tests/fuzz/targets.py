@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import random
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -11,9 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
+from tests.fuzz.model_bytes import PARSED, spoilt
+from tests.fuzz.mutation import mutated
 
-from rangesfm.errors import GeometryError, InputError
+from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.transform import rescale
+from rangesfm.errors import GeometryError, InputError, RangesfmError
 from rangesfm.export.apply import apply_to
+from rangesfm.export.ply import write_points
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
@@ -22,14 +30,17 @@ from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, read_err
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_summary import summarize_ranges
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges, write_ranges_csv
+from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.image_times import ImageTimes, read_image_times_csv
+from rangesfm.solver.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, read_reference
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 CORPUS = Path(__file__).parent / "corpus"
 _WHOLE_CHECK_EVERY = 8  # only some inputs, chosen by a checksum, because this check takes the longest
@@ -50,6 +61,7 @@ class Target:
         read: reads the file, or refuses it with one of REFUSALS.
         check: raises SilentAcceptanceError for what should not have been accepted.
         companions: further files beside it, which stay as they are: their names, and their paths in the corpus.
+        mutate: returns damaged content, no longer than a number of bytes.
     """
 
     name: str
@@ -57,6 +69,7 @@ class Target:
     read: Callable[[Path], Any]
     check: Callable[[Any], None]
     companions: tuple[tuple[str, str], ...] = ()
+    mutate: Callable[[bytes, random.Random, int], bytes] = mutated
 
     def seeds(self) -> list[Path]:
         return sorted((CORPUS / self.name).iterdir())
@@ -166,6 +179,30 @@ def _accept_all(found: object) -> None:
     pass
 
 
+def _use_model(model: pycolmap.Reconstruction) -> None:
+    """Do what is done with models."""
+    path = trajectory_from_reconstruction(model)
+    _expect(np.all(np.isfinite(path.centers)), "centres that are finite")
+    _expect(np.allclose(np.linalg.det(path.world_from_cam), 1), "rotations")
+    metric = rescale(model, Similarity(2.0, np.eye(3), np.ones(3)))
+    metric.update_point_3d_errors()
+    _expect(all(np.all(np.isfinite(point.xyz)) for point in metric.points3D.values()), "points that are finite")
+    with tempfile.TemporaryDirectory() as folder:
+        metric.write_binary(folder)
+        write_points(metric, Path(folder) / "points.ply")
+    with contextlib.suppress(RangesfmError):
+        problem = bundle_adjustment(metric, CameraOptions(), RefineOptions(max_num_iterations=2), num_threads=1)
+        solve_bundle_adjustment(problem, tolerance_m=1e-3)
+
+
+def _model_target(file_name: str) -> Target:
+    """Return the target of one file of a COLMAP model, binary or text, with the others beside it."""
+    files = [f"{Path(name).stem}{Path(file_name).suffix}" for name in PARSED]
+    others = tuple((name, f"model_{name}/{name}") for name in files if name != file_name)
+    mutate = partial(spoilt, file_name) if file_name in PARSED else mutated
+    return Target(f"model_{file_name}", file_name, lambda path: read_model(path.parent), _use_model, others, mutate)
+
+
 def _log_target(format: str, **options: Any) -> Target:
     return Target(format, "uwb.log", partial(read_ranges, format=format, **options), _check_log)
 
@@ -210,4 +247,6 @@ TARGETS: tuple[Target, ...] = (
     Target("apply_ply", "mesh.ply", _carry, _accept_all),
     Target("apply_obj", "mesh.obj", _carry, _accept_all),
     Target("apply_json", "cameras.json", _carry, _accept_all),
+    *(_model_target(name) for name in PARSED),
+    *(_model_target(name.replace(".bin", ".txt")) for name in PARSED),
 )

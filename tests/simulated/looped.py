@@ -170,11 +170,11 @@ class ScaledMap:
         estimate = initialize_scale(observations, trajectory, anchors, anchor_frame=survey.anchor_frame)
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
-    def refined_by_default(self) -> pycolmap.Reconstruction:
-        """Refine the scaled map with the errors of ranges that the scale stage found."""
+    def refined_by_default(self, refined: pycolmap.Reconstruction | None = None) -> pycolmap.Reconstruction:
+        """Refine the scaled map, or a refined one again, with the errors of ranges that the scale stage found."""
         estimate = self.estimate
-        refined, _ = refine_with_ranges(
-            self.scaled,
+        again, _ = refine_with_ranges(
+            self.scaled if refined is None else refined,
             self.trajectory,
             estimate.observations,
             estimate.metric_from_sfm,
@@ -183,9 +183,10 @@ class ScaledMap:
             tag_in_cam_m=TAG_IN_CAM_M,
             first_pose_is_fixed=self.survey.is_in_first_camera,
             camera=CameraOptions(refine_intrinsics=False),
+            is_refined=refined is not None,
             num_threads=1,
         )
-        return refined
+        return again
 
     def error_m(self, model: pycolmap.Reconstruction) -> float:
         """Return the root mean square error of the keyframes, without alignment."""
