@@ -17,14 +17,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from tests.outputs import names_in, paths_below, unfinished
+from tests.outputs import names_in, paths_below
 from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.util.files.output_folder import LOCK_NAME
 
 if TYPE_CHECKING:
-    from tests.conftest import Command, PhotoRun, WalkedSurvey
+    from tests.conftest import Command, WalkedSurvey
 
 Spoil = Callable[[Path], object]
 # What places the anchors with the least work: in the first camera's frame the map need not find its place.
@@ -495,10 +495,8 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 HANGS_AFTER_S = 600.0  # much longer than a loaded machine takes
 
 
-def interrupt_when(
-    happened: Callable[[], bool], process: subprocess.Popen[str], by: signal.Signals = signal.SIGINT
-) -> list[str]:
-    """Send Ctrl-C, or another signal, as soon as something has happened; return the process's messages."""
+def interrupt_when(happened: Callable[[], bool], process: subprocess.Popen[str], by: signal.Signals) -> list[str]:
+    """Send a signal as soon as something has happened; return the process's messages."""
     deadline = time.monotonic() + HANGS_AFTER_S
     while not happened():
         assert process.poll() is None, "the process ended before"
@@ -513,17 +511,16 @@ def interrupt_when(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="sees in /proc what has been loaded")
-def test_sigterm_ends_a_command_as_ctrl_c_does(
-    own_survey: WalkedSurvey, start: Callable[..., subprocess.Popen[str]]
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_ctrl_c_or_sigterm_ends_a_command_in_one_line(
+    by: signal.Signals, own_survey: WalkedSurvey, start: Callable[..., subprocess.Popen[str]]
 ) -> None:
     flags = ("--anchors", "anchors.csv", "--output_path", "out")
     process = start("refine", *own_survey.flags, *flags, cwd=own_survey.folder)
     maps = Path(f"/proc/{process.pid}/maps")
     lock = own_survey.folder / "out" / LOCK_NAME
     # These two libraries would print a stack trace.
-    lines = interrupt_when(
-        lambda: lock.exists() and {"_core", "pyceres"} <= loaded(maps.read_text()), process, by=signal.SIGTERM
-    )
+    lines = interrupt_when(lambda: lock.exists() and {"_core", "pyceres"} <= loaded(maps.read_text()), process, by)
     assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
     assert all(line.startswith(("scale", "refinement", "judgement", "rangesfm: error")) for line in lines)
     assert not (own_survey.folder / "out").exists()
@@ -532,37 +529,6 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(
 def loaded(maps: str) -> set[str]:
     """Return the names of the libraries that a process has loaded, up to their first dot."""
     return {Path(line.split()[-1]).name.partition(".")[0] for line in maps.splitlines() if "/" in line}
-
-
-class TestCtrlC:
-    def test_in_mapping_keeps_the_matches_and_the_next_run_goes_on_from_them(
-        self,
-        photo_run: PhotoRun,
-        start: Callable[..., subprocess.Popen[str]],
-        rangesfm_command: Command,
-        tmp_path: Path,
-    ) -> None:
-        out = shutil.copytree(photo_run.output_path, tmp_path / "out")
-        survey = photo_run.survey.folder / "other_mapping.toml"
-        survey.write_text(
-            (photo_run.survey.folder / "survey.toml").read_text() + "[mapper.pipeline]\nmin_model_size = 4\n"
-        )
-        flags = (str(survey), *photo_run.flags[1:], "--output_path", str(out))
-        before = {path: path.read_bytes() for path in paths_below(out) if path.is_file()}
-        is_mapping = (unfinished(out) / ".mapping.part").exists
-        lines = interrupt_when(is_mapping, start("run", *flags, cwd=tmp_path))
-        assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
-        assert sum(line.startswith("rangesfm:") for line in lines) == 1
-        assert lines[-2].startswith("mapping: stopped after ")
-        assert {path: path.read_bytes() for path in paths_below(out) if path.is_file()} == before
-        with pycolmap.Database.open(unfinished(out) / "database.db") as database:
-            assert database.num_verified_image_pairs() > 13
-
-        done = rangesfm_command("run", *flags, cwd=tmp_path)
-        assert "matching: taken over from an earlier run\nmapping ...\n" in done.stderr
-        results = [json.loads((path / "result.json").read_text()) for path in (out, photo_run.output_path)]
-        scales = [result["scale"]["value"] for result in results]
-        assert scales[0] == pytest.approx(scales[1], rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import itertools
 import subprocess
 import sys
 import textwrap
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,10 +15,7 @@ import pycolmap
 import pytest
 
 from rangesfm.solver import (
-    PlacedRanges,
-    RangeBlocks,
     add_normal_prior,
-    add_ranges,
     add_residual_block,
     distance_cost,
     keep_from_elimination,
@@ -95,13 +91,15 @@ def test_further_errors_widen_a_normal_prior(reconstruction: pycolmap.Reconstruc
         ([1.0, 2.0], [1.0, -1.0]),
         ([1.0, np.nan], 1.0),
         ([1.0, 2.0], np.inf),
+        ([1.0, 2.0], 1e-200),  # no number can hold its variance
+        ([1.0, 2.0], 1e200),
     ],
 )
 def test_a_normal_prior_that_means_nothing_is_refused(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, mean: list[float], stddev: float | list[float]
 ) -> None:
     # Given such a prior, Ceres would abort the process.
-    with pytest.raises(ValueError, match=r"prior of|broadcast"):
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match=r"^a prior of|broadcast"):
         add_normal_prior(adjuster_of(reconstruction), np.zeros(2), mean, stddev)
 
 
@@ -297,67 +295,3 @@ def test_references_may_be_dropped_in_any_order(first: str) -> None:
     script = textwrap.dedent(LIFETIMES).format(imports=imports)
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
     assert run.returncode == 0, run.stderr[-2000:]
-
-
-def empty_adjuster() -> pycolmap.CeresBundleAdjuster:
-    """Return a bundle adjuster of nothing, to which residuals may be added."""
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.num_threads = 1
-    config = pycolmap.BundleAdjustmentConfig()
-    return pycolmap.create_default_ceres_bundle_adjuster(options, config, pycolmap.Reconstruction())
-
-
-def unturned(*translation: float) -> Array:
-    """Return the block of a pose without rotation, whose centre is minus the translation."""
-    return np.array([0.0, 0, 0, 1, *translation])
-
-
-@pytest.mark.parametrize("stddev", [1e-200, 1e200])
-def test_a_prior_whose_variance_no_number_can_hold_is_refused(stddev: float) -> None:
-    with (
-        np.errstate(over="ignore"),
-        pytest.raises(ValueError, match=r"^a prior of mean \[1.0, 2.0\] and stddev 1e.200, expected finite and pos"),
-    ):
-        add_normal_prior(empty_adjuster(), np.zeros(2), [1.0, 2.0], stddev)
-
-
-def placed(before: int, after: int) -> PlacedRanges:
-    """Return three ranges, of which those in rows 0 and 2 are at one place, with all that they may have."""
-    return PlacedRanges(
-        range_m=np.array([3.0, 99.0, 4.0]),
-        stddev_m=np.array([0.5, 99.0, 0.25]),
-        before=np.array([before, 0, before]),
-        after=np.array([after, 0, after]),
-        weight=np.array([0.25, 0.9, 0.5]),
-        offset_in_world_m=np.array([[0.0, 0, 0], [9, 9, 9], [-0.5, 0, 0]]),
-        anchor_index=np.array([1, 0, 1]),
-        tag_index=np.array([1, 0, 1]),
-        interval_s=np.array([0.5, 99.0, 0.5]),
-        share=np.array([4.0, 99.0, 9.0]),
-        loadings_m=np.array([[0.1, 0.0], [9.0, 9.0], [0.0, 0.2]]),
-    )
-
-
-def blocks_with_all() -> RangeBlocks:
-    """Return blocks of everything; all poses and tags are on the x axis, on which anchor 1 is at 10 m."""
-    return RangeBlocks(
-        poses=[unturned(9, 9, 9), unturned(-1, 0, 0), unturned(-5, 0, 0)],  # at x = 1 and x = 5
-        anchors=[np.full(3, 9.0), np.array([10.0, 0, 0])],
-        biases=[np.array([9.0]), np.array([0.3])],
-        tags_in_cam=[np.full(3, 9.0), np.array([2.0, 0, 0])],
-        time_shift=np.array([0.125]),
-        amplitude=np.array([0.6]),
-        shared=[np.array([1.0, 2.0])],
-    )
-
-
-def test_ranges_that_lack_a_part_of_their_model_are_refused() -> None:
-    ranges, blocks = placed(1, 2), blocks_with_all()
-    of_short = "^of short_range_length_m and its amplitude one is given without the other$"
-    with pytest.raises(ValueError, match=of_short):
-        add_ranges(empty_adjuster(), ranges, replace(blocks, amplitude=None), short_range_length_m=2.0)
-    with pytest.raises(ValueError, match=of_short):
-        add_ranges(empty_adjuster(), ranges, blocks)
-    of_shift = "^a time shift needs interval_s, the time between the keyframes of each range$"
-    with pytest.raises(ValueError, match=of_shift):
-        add_ranges(empty_adjuster(), replace(ranges, interval_s=None), blocks, short_range_length_m=2.0)

@@ -348,20 +348,6 @@ class TestBias:
         assert [anchor.range_bias_m for anchor in estimate.anchors] == [0.0] * 5
 
 
-def test_order_of_the_ranges_does_not_matter(make_survey: MakeSurvey) -> None:
-    survey = make_survey(radio=Radio(range_stddev_m=0.1, obstructed_share=0.2), num_epochs=2)
-    log = survey.log
-    order = np.random.default_rng(0).permutation(len(log))
-    shuffled = RangeLog.from_arrays(
-        [log.anchor_ids[k] for k in log.anchor_index[order]], log.range_m[order], timestamp_s=log.timestamp_s[order]
-    )
-    first, second = survey.scale("first_camera", "ABCDE"), survey.scale("first_camera", "ABCDE", shuffled)
-    assert second.value == pytest.approx(first.value, rel=1e-9)
-    assert second.uncertainty.formal == pytest.approx(first.uncertainty.formal, rel=1e-6)
-    assert second.uncertainty.empirical == pytest.approx(first.uncertainty.empirical, rel=1e-6)
-    np.testing.assert_array_equal(second.observations.status, first.observations.status[order])
-
-
 def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE, num_epochs=2)
     held_out = hold_out(survey.observations(), RangesOptions(check_share=0.2), seed=0)
