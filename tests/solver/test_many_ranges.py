@@ -131,23 +131,6 @@ def test_each_range_has_its_residual_where_it_is_said_to_be(
     np.testing.assert_allclose(np.asarray(together.problem.evaluate_residuals())[rows], expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("loss_scale", [np.inf, 2.0], ids=["least squares", "robust"])
-def test_a_range_counts_as_often_as_its_share_says(
-    reconstruction: pycolmap.Reconstruction,
-    ranges: PlacedRanges,
-    adjuster_of: AdjusterOf,
-    pose_block: PoseBlock,
-    loss_scale: float,
-) -> None:
-    blocks = blocks_of(reconstruction, pose_block)
-    thrice, shared = adjuster_of(reconstruction), adjuster_of(reconstruction)
-    for _ in range(3):
-        add_ranges(thrice, ranges, blocks, loss_scale=loss_scale)
-    add_ranges(shared, replace(ranges, share=np.full(NUM_RANGES, 3.0)), blocks, loss_scale=loss_scale)
-    assert gradient_norm(shared) == pytest.approx(gradient_norm(thrice), rel=1e-9)
-    assert cost_of(shared) == pytest.approx(cost_of(thrice), rel=1e-9)
-
-
 def test_everything_that_can_be_estimated_reaches_its_block(
     reconstruction: pycolmap.Reconstruction, ranges: PlacedRanges, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
