@@ -27,7 +27,6 @@ TESTS = (
     "tests/measurements/ranges/anchors/test_trilateration.py",
     "tests/measurements/ranges/errors",
     "tests/measurements/ranges/test_association.py",
-    "tests/measurements/ranges/test_range_gradient.py",
     "tests/estimation/test_carry.py",
     "tests/estimation/test_keyframe_graph.py",
     "tests/estimation/test_vision_information.py",
