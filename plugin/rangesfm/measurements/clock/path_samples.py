@@ -21,9 +21,11 @@ from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.similarity import rounding_of
 from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around, places_in_time
 
-# Time between samples of the path, and between offsets: a twentieth of the time in which a walker's motion changes.
-# Linear interpolation between samples is off by less than a millimetre at an acceleration of 3 m/s^2.
-_STEP_S = 0.05
+STEP_S = 0.05
+"""Time between samples of the path, and between offsets: a twentieth of the time in which a walker's motion changes.
+
+Linear interpolation between samples is off by less than a millimetre at an acceleration of 3 m/s^2.
+"""
 # Largest number of samples, and of offsets; if path and log together last more than seven hours, the step is longer.
 _MAX_NUM_STEPS = 500_000
 MIN_COVERAGE = 0.5
@@ -130,7 +132,7 @@ def _times(trajectory: Trajectory) -> Array:
 def _steps(keyframes_s: Array, beyond_s: float) -> tuple[float, float, int]:
     """Return the first time of samples, the time between them and their number."""
     start_s, span_s = float(keyframes_s[0]) - beyond_s, float(np.ptp(keyframes_s)) + 2 * beyond_s
-    step_s = max(_STEP_S, span_s / _MAX_NUM_STEPS)
+    step_s = max(STEP_S, span_s / _MAX_NUM_STEPS)
     return start_s, step_s, int(span_s / step_s) + 1
 
 

@@ -26,8 +26,8 @@ _PRIOR_OF_THE_OTHERS = 0.05
 _LEAST_DIFFERENCE = 0.02  # of the durations, as a share, below which it says no more
 # Two offsets with a smaller fraction of observations in common are compared by all that each puts on the path.
 _MIN_SHARED = 0.25
-# Largest number of candidates from the scan.
-_MAX_NUM_CANDIDATES = 12
+MAX_NUM_CANDIDATES = 12
+"""Largest number of offsets of the scan from which the search begins."""
 # Numbers of observations that suffice to compare candidates, and for the final estimate.
 _NUM_PER_CANDIDATE = 3000
 _NUM_OF_FINAL = 40000
@@ -56,7 +56,7 @@ def offset_of_motion(observed: Observed, *, seed: int = 0, progress: Progress = 
     """
     # All offsets use observations in the same random order, so that different offsets are compared by the same ones.
     mixed = observed.take(np.random.default_rng(seed).permutation(len(observed.times_s)))
-    candidates = observed.scan(observed.start_weights).peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
+    candidates = observed.scan(observed.start_weights).peaks(SEPARATION_S, MAX_NUM_CANDIDATES)
     fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))

@@ -17,6 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask, rms
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.measurements.clock.fit import SEPARATION_S
+from rangesfm.measurements.clock.offset import OffsetCurve
+from rangesfm.measurements.clock.path_samples import STEP_S
+from rangesfm.measurements.clock.search import MAX_NUM_CANDIDATES
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.geometry.robust_statistics import CAUCHY
@@ -27,11 +31,6 @@ MIN_NUM_TURNS = 8
 """Fewest turns between photos that tell offset, rotation and bias, seven numbers of three equations each."""
 # Photos further apart say little: a cheap gyroscope's bias of 0.01 rad/s turns by as much as the photos themselves.
 _LONGEST_S = 5.0
-# Step of the first search: people and drones turn by frequencies below some 2 Hz.
-_STEP_S = 0.05
-# Offsets within this of each other are one: no movement repeats so fast.
-_APART_S = 0.5
-_NUM_CANDIDATES = 12
 _NUM_ITERATIONS = 30
 # Share of the turns that must be within the log, so that few chance turns do not decide.
 _LEAST_SHARE = 0.3
@@ -228,7 +227,7 @@ def _best(log: ImuLog, turns: _PhotoTurns) -> tuple[ImuAlignment, ImuAlignment |
     for offset_s in _candidates(log, turns):
         start = _started(log, turns, offset_s)
         fit = None if start is None else _refined(turns, start)
-        if fit is not None and all(abs(fit.time_offset_s - one.time_offset_s) > _APART_S for one in found):
+        if fit is not None and all(abs(fit.time_offset_s - one.time_offset_s) > SEPARATION_S for one in found):
             found.append(fit)
     if not found:
         raise GeometryError(f"{log.name}: at no time offset do the turns of the gyroscope fit those of the photos")
@@ -245,22 +244,22 @@ def _badness(fit: ImuAlignment) -> float:
 def _candidates(log: ImuLog, turns: _PhotoTurns) -> list[float]:
     """Return the offsets at which the angles of the turns agree best, all apart."""
     least_s, most_s = turns.from_s[0] - log.timestamp_s[-1], turns.to_s[-1] - log.timestamp_s[0]
-    offsets_s = np.arange(least_s, most_s, _STEP_S)
+    offsets_s = np.arange(least_s, most_s, STEP_S)
     angles = np.linalg.norm(turns.vectors, axis=1)
     need = max(MIN_NUM_TURNS, _LEAST_SHARE * len(turns))
-    cost = np.full(len(offsets_s), np.inf)
+    num, errors, scale = np.zeros((3, len(offsets_s)))
     for some in np.array_split(np.arange(len(offsets_s)), max(1, len(offsets_s) * len(turns) // 1_000_000)):
         from_s, to_s = (times - offsets_s[some, None] for times in (turns.from_s, turns.to_s))
         known = log.knows(from_s, to_s)
         ends = (log.nearest_quaternions(times) for times in (from_s, to_s))
         cosines = np.abs(np.einsum("otq,otq->ot", *ends))
         of_sensor = 2 * np.arccos(np.minimum(cosines, 1.0))
-        num = known.sum(axis=1)
-        # The length of an error counts, not its square: some photos may have a wrong pose.
-        errors = np.where(known, np.abs(of_sensor - angles), 0.0).sum(axis=1)
-        scale = np.where(known, angles, 0.0).sum(axis=1)
-        cost[some] = np.where(num >= need, errors / np.maximum(scale, 1e-300), np.inf)
-    if not np.isfinite(cost).any():
+        num[some] = known.sum(axis=1)
+        # The sum of lengths counts, not that of squares: some photos may have a wrong pose.
+        errors[some] = np.where(known, np.abs(of_sensor - angles), 0.0).sum(axis=1)
+        scale[some] = np.where(known, angles, 0.0).sum(axis=1)
+    tried = np.flatnonzero(num >= need)
+    if not len(tried):
         of_log = span_text(log.timestamp_s[0], log.timestamp_s[-1])
         of_photos = span_text(turns.from_s[0], turns.to_s[-1])
         raise InputError(
@@ -268,13 +267,8 @@ def _candidates(log: ImuLog, turns: _PhotoTurns) -> list[float]:
             f"({of_photos})",
             log.path or None,
         )
-    chosen = list[float]()
-    for k in np.argsort(cost, kind="stable").tolist():
-        if not np.isfinite(cost[k]) or len(chosen) == _NUM_CANDIDATES:
-            break
-        if all(abs(offsets_s[k] - one) > _APART_S for one in chosen):
-            chosen.append(float(offsets_s[k]))
-    return chosen
+    curve = OffsetCurve(offsets_s, num, np.maximum(scale, 1e-9) ** 2, np.maximum(errors, 1e-9) ** 2)
+    return curve.take(tried).peaks(SEPARATION_S, MAX_NUM_CANDIDATES)
 
 
 def _started(log: ImuLog, turns: _PhotoTurns, offset_s: float) -> ImuAlignment | None:
@@ -324,7 +318,7 @@ def _refined(turns: _PhotoTurns, start: ImuAlignment, *, is_rotation_held: bool 
         inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
         step = inverse @ gradient
         covariance = _covariance(normal, stddev, is_free)
-        longest = max(1.0, abs(step[0]) / (0.5 * _APART_S), float(np.linalg.norm(step[1:4])))
+        longest = max(1.0, abs(step[0]) / (0.5 * SEPARATION_S), float(np.linalg.norm(step[1:4])))
         step /= longest
         offset_s, bias = offset_s + step[0], bias + step[4:]
         rotation = Rotation.from_rotvec(step[1:4]).as_matrix() @ rotation
