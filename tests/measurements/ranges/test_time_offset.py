@@ -340,6 +340,13 @@ def test_one_offset_of_two_laps_is_far_likelier_if_log_and_photos_were_begun_and
     assert any(abs(offset_s - 3.0) < 0.1 for offset_s in (half.value_s, *(rival.value_s for rival in half.rivals)))
 
 
+def test_a_walk_on_a_level_floor_tells_the_offset_and_how_well() -> None:
+    walk = handheld(60)
+    level = Walk(lambda times: walk.center(times) * [1.0, 1.0, 0.0], no_turn)
+    found = estimate(level.log(range_times(0, 60), 2.0), level.photos(photo_times(60), center_stddev_m=0.0))
+    assert abs(found.value_s - 2.0) < 4 * found.stddev_s < 0.1
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_offset_that_the_motion_tells_but_loosely_is_given_with_its_stddev(seed: int) -> None:
     """A later time looks nearly the same as a place further round, on a third of an even walk around an ellipse."""

@@ -95,13 +95,14 @@ class TimedRanges(Observed):
         is_curved = alpha_squared * length > _MIN_CURVATURE_STDDEVS * np.std(residuals)
         of_all = np.zeros((num, len(by_basis), 4))
         of_all[np.arange(num), group] = basis
+        is_kept = by_basis.any(axis=1).ravel()
         return OffsetFit(
             offset_s,
             here,
             weights,
             residuals_m,
             rates,
-            np.column_stack([of_all.reshape(num, -1), curvature / max(length, 1e-300)]),
+            np.column_stack([of_all.reshape(num, -1)[:, is_kept], curvature / max(length, 1e-300)]),
             4 * len(by_basis) + 1,
             float(np.sqrt(alpha_squared)) / unit if is_curved else np.inf,
         )
