@@ -229,8 +229,7 @@ def write_positions(survey: WalkedSurvey) -> None:
     """Write noisy positions of an antenna at the moments of the photos, by another clock."""
     path, rng = site_path(survey), np.random.default_rng(8)
     antennas = path.centers + path.world_from_cam @ [0.1, -0.3, 0.05] + 0.03 * rng.standard_normal((len(path), 3))
-    assert path.timestamps_s is not None
-    write_reference(Reference(antennas, ByTime(path.timestamps_s + 12.25)), survey.folder / "positions.csv")
+    write_reference(Reference(antennas, ByTime(path.times_s + 12.25)), survey.folder / "positions.csv")
 
 
 def found_by(case: Case, survey: WalkedSurvey, command: Command) -> Numbers:
@@ -325,8 +324,7 @@ def test_a_survey_gives_what_it_gave(name: str, survey: WalkedSurvey, rangesfm_c
 def write_known(survey: WalkedSurvey) -> tuple[str, ...]:
     """Write the true path of the camera, and return the flags that use it."""
     path = site_path(survey)
-    assert path.timestamps_s is not None
-    known = Reference(path.centers, ByTime(path.timestamps_s), path.world_from_cam)
+    known = Reference(path.centers, ByTime(path.times_s), path.world_from_cam)
     write_reference(known, survey.folder / "known.csv")
     tag = ",".join(map(str, TAG_IN_CAM_M))
     return ("--positions", "known.csv", "--tag_in_cam", tag, "--time_offset", "2", "--max_interpolation_gap_s", "1.5")

@@ -185,7 +185,9 @@ def main() -> None:
     for given in arguments.photos:
         if given.endswith(".toml"):
             print(f"\n{given}:", flush=True)
-            compare_with_metric_map(read_survey(given, None, arguments.base_path), num, arguments.num_rounds, seed)
+            compare_with_metric_map(
+                read_survey(given, base_folder=arguments.base_path), num, arguments.num_rounds, seed
+            )
             continue
         folder, _, every_nth = given.partition(":")
         photos = Path(folder)

@@ -90,8 +90,7 @@ def test_written_anchors_hold_a_survey_in_their_frame(
     path = trajectory_from_reconstruction(model, photo_times).transformed(
         placed.scale, placed.rotation, placed.translation
     )
-    assert path.timestamps_s is not None
-    known = Reference(path.centers, ByTime(path.timestamps_s), path.world_from_cam)
+    known = Reference(path.centers, ByTime(path.times_s), path.world_from_cam)
     write_reference(known, tmp_path / "known.csv")
     offset = walked_survey.flags[-1]
     flags = ("--positions", tmp_path / "known.csv", "--tag_in_cam", walked_survey.flags[-3], "--time_offset", offset)

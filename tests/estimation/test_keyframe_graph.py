@@ -41,8 +41,7 @@ def make_graph(
     """Build a graph with exact ranges to four anchors, at every keyframe and half-way to the next."""
     truth, rays = poses_and_rays(model)
     path = trajectory_from_reconstruction(model.reconstruction, model.timestamps_s)
-    assert path.timestamps_s is not None
-    times = np.union1d(path.timestamps_s, path.timestamps_s[:-1] + np.diff(path.timestamps_s) / 2)
+    times = np.union1d(path.times_s, path.times_s[:-1] + np.diff(path.times_s) / 2)
     m = len(ANCHORS_M)
     ids = [f"A{k}" for k in range(m)] * len(times)
     log = RangeLog.from_arrays(ids, np.ones(len(ids)), timestamp_s=np.repeat(times, m))

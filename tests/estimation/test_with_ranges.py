@@ -31,7 +31,7 @@ from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import Marker, Tape, TapedDistance
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.errors.noise import shared_stddev
+from rangesfm.measurements.ranges.errors.noise import short_range_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
@@ -598,7 +598,7 @@ class TestBesideTheMap:
         short = -0.3 * np.exp(-log.range_m)
         assert np.abs(short).max() > 0.05
         observations = replace(survey.observations, log=replace(log, range_m=log.range_m + short))
-        stddev = np.hypot(0.03, shared_stddev(observations.log.range_m, None))
+        stddev = np.hypot(0.03, short_range_stddev(observations.log.range_m))
         _, held = survey.refine(survey.anchors(0.0), observations=observations, errors=stddev)
         assert held.ranges.short_range_error_m is None
         options = RefineOptions(short_range_stddev_m=0.3)

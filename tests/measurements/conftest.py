@@ -161,9 +161,8 @@ def _positions(path: Trajectory, rng: np.random.Generator) -> AntennaPositions:
     before = np.array([3, 0, 8, 0, 5, 9])
     after = before + np.array([1, 1, 1, 1, 0, 1])
     fraction = np.where(after > before, rng.uniform(0.1, 0.9, 6), 0.0)
-    assert path.timestamps_s is not None
     places = AntennaPlaces(
-        before, after, fraction, path.timestamps_s[after] - path.timestamps_s[before],
+        before, after, fraction, path.times_s[after] - path.times_s[before],
         (after > before)[:, None] * rng.normal(0, 0.1, (6, 3)),
     )  # fmt: skip
     roots = np.linalg.inv(np.linalg.cholesky([0.1**2 * np.eye(3) + np.outer(v, v) for v in rng.normal(0, 0.1, (6, 3))]))
@@ -175,9 +174,8 @@ def _positions(path: Trajectory, rng: np.random.Generator) -> AntennaPositions:
 
 def _motions(path: Trajectory, rng: np.random.Generator) -> InertialMotions:
     """Return the motions of a sensor between photos, of which one is missing."""
-    assert path.timestamps_s is not None
     log_s, num = np.linspace(-0.1, 6.1, 100), len(path)
-    intervals = preintegrate(log_s, rng.normal(0, 0.1, (100, 3)), rng.normal(0, 1, (100, 3)) + 9.8, path.timestamps_s)
+    intervals = preintegrate(log_s, rng.normal(0, 0.1, (100, 3)), rng.normal(0, 1, (100, 3)) + 9.8, path.times_s)
     intervals = intervals.subset(np.delete(np.arange(num - 1), 4))
     start = {velocity_block(photo): rng.normal(0, 1, 3) for photo in range(num)}
     start |= {bias_block(k): rng.normal(0, 0.1, 6) for k in range(3)}

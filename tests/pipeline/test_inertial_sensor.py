@@ -31,8 +31,7 @@ def write_survey(
 ) -> None:
     """Write the path of the photos as a model, the sensor's log, and ranges of a radio at the camera."""
     path = photos(motion, noise_rad=3e-4)
-    assert path.timestamps_s is not None
-    times = dict(zip(path.image_names, path.timestamps_s.tolist(), strict=True))
+    times = dict(zip(path.image_names, path.times_s.tolist(), strict=True))
     write_model(model_of_poses(path), folder / "sparse", times, folder / "images.csv")
     log = imu_log(motion, offset_s=OFFSET_S)
     rows = np.column_stack([log.timestamp_s, gyro_factor * log.gyro_rad_s, log.accel_m_s2]).tolist()

@@ -95,8 +95,7 @@ class Halves:
         write_ranges_csv(self.log, folder / "uwb.csv")
         rows = ["image_name,timestamp_s\n"]
         for path in (part.trajectory for part in self.parts):
-            assert path.timestamps_s is not None
-            rows += [f"{name},{time!r}\n" for name, time in zip(path.image_names, path.timestamps_s.tolist())]
+            rows += [f"{name},{time!r}\n" for name, time in zip(path.image_names, path.times_s.tolist())]
         (folder / "images.csv").write_text("".join(rows))
         return Survey().changed(
             {

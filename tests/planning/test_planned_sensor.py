@@ -37,9 +37,8 @@ def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion
     assert sensor.alignment is not None
     problem = InertialProblem.of_sensor(sensor, sensor.alignment, path, WalkBending(in_first_camera(path)))
     run = scale_by_sensor(problem)
-    assert path.timestamps_s is not None
-    turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
-    true = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
+    turns = motion.world_from_imu(path.times_s).as_matrix() @ CAM_FROM_IMU.T
+    true = replace(path, centers=motion.places_m(path.times_s), world_from_cam=turns)
     on_map = PlannedSensor().on_map(true, PlannedBending(WalkBending(in_first_camera(true)), {}))
     alike = replace(replace(on_map, sizes=run.sizes).alone.problem, sizes=run.alone.problem.sizes)
     assert alike.posterior().uncertainty.empirical == pytest.approx(run.alone.posterior.uncertainty.empirical, rel=0.15)

@@ -243,7 +243,8 @@ def expected_drift_m(truth: Truth) -> float:
     """Return the root mean square error of the keyframes of a map by features with a noise of 1 px, to first order."""
     model = pycolmap.Reconstruction(truth.model.reconstruction)
     problem = photos_adjuster(truth, model).problem
-    covariance = joint_covariance(NormalEquations.of(problem, model, problem.num_residuals()))
+    equations = NormalEquations.of(problem, model, problem.num_residuals())
+    covariance = joint_covariance(equations, firm_frame_ids=equations.columns.frames)
     return float(np.sqrt(np.mean(np.trace(covariance.covariances("frame")[:, 3:, 3:], axis1=1, axis2=2))))
 
 

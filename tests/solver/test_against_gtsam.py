@@ -119,7 +119,8 @@ def by_ceres(measured: Measured) -> tuple[Array, Array, MapErrors]:
         keep_from_elimination(adjuster, block, point)
     adjuster.solve()
     equations = NormalEquations.of(problem, reconstruction, num_reprojections, anchors, no_bias)
-    covariance = joint_covariance(equations, anchors=dict(zip("ABCDEFGH", anchors, strict=False)))
+    named = dict(zip("ABCDEFGH", anchors, strict=False))
+    covariance = joint_covariance(equations, anchors=named, firm_frame_ids=equations.columns.frames)
     return centers_and_rotations(reconstruction)[0], np.array(anchors), covariance
 
 

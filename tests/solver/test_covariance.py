@@ -67,7 +67,8 @@ class Joint:
             self.problem, self.reconstruction, self.num_reprojections, blocks["anchors"], blocks["others"]
         )
         anchors = {f"A{k}": anchor for k, anchor in enumerate(blocks["anchors"])}
-        errors = joint_covariance(equations, anchors=anchors, residual_stddev=residual_stddev)
+        firm_ids = equations.columns.frames
+        errors = joint_covariance(equations, anchors=anchors, residual_stddev=residual_stddev, firm_frame_ids=firm_ids)
         return Found(errors, self.poses, equations.free.shape[1])
 
 

@@ -177,8 +177,7 @@ def written(survey: MadeSurvey, folder: Path) -> Tables:
 
 def write_map(survey: MadeSurvey, folder: Path) -> None:
     path = survey.trajectory
-    assert path.timestamps_s is not None
-    timestamps_s = dict(zip(path.image_names, path.timestamps_s.tolist(), strict=True))
+    timestamps_s = dict(zip(path.image_names, path.times_s.tolist(), strict=True))
     write_model(survey.model, folder / "sparse", timestamps_s, folder / "images.csv")
 
 
@@ -272,15 +271,10 @@ def noise_of(metric: MetricResult) -> Values:
     """Return the standard deviation of each component of the noise, as learnt for the final map."""
     on_map = metric.all_measured
     learnt = {
-        "ranges": metric.estimate.errors.learned,
-        "positions": on_map.problem.noise_of(POSITIONS) if POSITIONS in on_map.observed else None,
+        "ranges": metric.estimate.ranges.error_stddevs,
+        "positions": on_map.problem.noise_of(POSITIONS).stddev_of_component if POSITIONS in on_map.observed else {},
     }
-    return {
-        f"{kind} noise {name}": np.array(stddev)
-        for kind, errors in learnt.items()
-        if errors is not None
-        for name, stddev in zip(errors.names, errors.stddevs.tolist(), strict=True)
-    }
+    return {f"{kind} noise {name}": np.array(of) for kind, found in learnt.items() for name, of in found.items()}
 
 
 def covariances_of(metric: MetricResult) -> Values:

@@ -96,21 +96,20 @@ def located(sensor: InertialSensor, path: Trajectory) -> tuple[InertialScale, st
 
 def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
     log, path = made(motion, GRADES[of_grade], seed)
-    assert path.timestamps_s is not None
     try:
         given = CAM_FROM_IMU if motion.amplitudes_rad[:2].max() < 0.05 else None
         found, told = located(InertialSensor(log, cam_from_imu=given), path)
     except GeometryError as error:
         return Found(np.nan, np.nan, np.inf, str(error))
     known = found.alone
-    true = align_points(path.centers, motion.places_m(path.timestamps_s)).scale
+    true = align_points(path.centers, motion.places_m(path.times_s)).scale
     off = float(np.log(known.scale.value / true)) / known.posterior.uncertainty.empirical
     upward = Rotation.from_rotvec([0.3, -1.0, 2.0]).apply([0.0, 0.0, 1.0])  # as ``photos`` turned the world
     away = found.upward.up_in_first_camera - path.world_from_cam[0].T @ upward
     doubts = told_by(found)
     tilt = float(np.linalg.norm(away)) / np.sqrt(2) / found.upward.stddev_rad
-    turns = motion.world_from_imu(path.timestamps_s).as_matrix() @ CAM_FROM_IMU.T
-    path = replace(path, centers=motion.places_m(path.timestamps_s), world_from_cam=turns)
+    turns = motion.world_from_imu(path.times_s).as_matrix() @ CAM_FROM_IMU.T
+    path = replace(path, centers=motion.places_m(path.times_s), world_from_cam=turns)
     sensor = PlannedSensor(grade=of_grade)  # type: ignore[arg-type]
     planned = sensor.on_map(path, PlannedBending(WalkBending(in_first_camera(path)), sensor.sizes)).alone
     widths = known.posterior.uncertainty.half_width_95, planned.posterior.uncertainty.half_width_95

@@ -104,8 +104,7 @@ def points_of(truth: Truth, rng: np.random.Generator) -> ControlPoints:
 
 def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> AntennaTrack:
     """Return positions of the antenna once a second; their time offset is not known."""
-    assert survey.trajectory.timestamps_s is not None
-    first_s, last_s = survey.trajectory.timestamps_s[[0, -1]].tolist()
+    first_s, last_s = survey.trajectory.times_s[[0, -1]].tolist()
     times, receiver = np.arange(first_s, last_s, 1.0), RECEIVERS["positions"]
     true_m = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
     covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
@@ -116,9 +115,8 @@ def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> 
 def exif_of(survey: MadeSurvey, rng: np.random.Generator) -> AntennaTrack:
     """Return a position of each photo, with the accuracy that is taken for EXIF positions without a word about it."""
     path = survey.trajectory
-    assert path.timestamps_s is not None
     covariances = np.tile(AUTONOMOUS_STDDEV_M**2 * np.eye(3), (len(path), 1, 1))
-    at_m = survey.true_centers_m + RECEIVERS["exif"].errors_m(path.timestamps_s, rng)
+    at_m = survey.true_centers_m + RECEIVERS["exif"].errors_m(path.times_s, rng)
     log = PositionLog(at_m, covariances, ByPhoto(path.image_names), np.arange(len(path)))
     return AntennaTrack(log, np.zeros(3), None, RangesOptions())
 

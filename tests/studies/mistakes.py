@@ -269,8 +269,7 @@ def _grown(given: MadeSurvey, tags_m: Array) -> Array:
 def _map_breaks(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     """Displace the second half of the map, as a false match would; its true place is then that of the first half."""
     path = given.trajectory
-    times = path.timestamps_s
-    assert times is not None
+    times = path.times_s
     direction = rng.normal(size=3)
     after = (times > np.quantile(times, 0.45))[:, None]
     by = size / given.metres_per_unit * direction / np.linalg.norm(direction)

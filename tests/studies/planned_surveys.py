@@ -151,8 +151,7 @@ def measured(
     """Simulate one such survey: all of its ranges, on a bent map, the anchors as told, and the taped lengths."""
     rng = np.random.default_rng(seed)
     stddevs, true = stddevs_of(planned), planned.trajectory
-    times = true.timestamps_s
-    assert times is not None
+    times = true.times_s
     ids = [anchor.anchor_id for anchor in planned.anchors]
     turn = np.arange(planned.num_ranges)
     at_s = times[0] + (turn + 0.5) / (planned.rate_hz * len(ids))
@@ -161,7 +160,7 @@ def measured(
     standing_m = np.array([planned.anchors_m[ids.index(name)] for name in log.anchor_ids])
     errors_m, distance_m = errors_of_radio(places, true, standing_m, stddevs, planned.curve_stddev_m, rng)
     ranges_m = np.maximum(np.nan_to_num(distance_m + errors_m, nan=1.0), 0.02)
-    curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
+    curve = np.full(len(log), np.nan if planned.curve_stddev_m is None else planned.curve_stddev_m)
     log = replace(log, range_m=ranges_m, shared_stddev_m=curve)
     bent = replace(true, centers=true.centers + stddevs["bending"] * _bend(times, rng))
     of_map = in_world_of_its_own(rng)

@@ -163,10 +163,9 @@ def placed(
 
 def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLog, Trajectory, float]:
     """Keep the ranges within 50 ms of a pose, and refer to it by its name instead of the time."""
-    assert path.timestamps_s is not None
     times = log.timestamp_s + offset_s
-    nearest = np.abs(times[:, None] - path.timestamps_s).argmin(axis=1)
-    near = np.abs(times - path.timestamps_s[nearest]) < 0.05
+    nearest = np.abs(times[:, None] - path.times_s).argmin(axis=1)
+    near = np.abs(times - path.times_s[nearest]) < 0.05
     names = tuple(path.image_names[k] for k in nearest[near])
     return replace(log.subset(near), moments=ByPhoto(names)), replace(path, timestamps_s=None), 0.0
 

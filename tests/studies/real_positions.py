@@ -58,8 +58,7 @@ def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, Scale
 
 def true_antenna(path: Trajectory, times: Array, centers_m: Array, world_from_cam: Array) -> tuple[Array, Array]:
     """Return times and positions of the antenna once a second, where the true path is known."""
-    assert path.timestamps_s is not None
-    at_s = np.arange(np.ceil(path.timestamps_s[0]), path.timestamps_s[-1], 1.0)
+    at_s = np.arange(np.ceil(path.times_s[0]), path.times_s[-1], 1.0)
     nearest = np.abs(times[:, None] - at_s).argmin(axis=0)
     at_m = interpolated(times, centers_m, at_s) + world_from_cam[nearest] @ ANTENNA_IN_CAM_M
     is_known = np.isfinite(at_m).all(axis=1)
@@ -76,8 +75,7 @@ def main() -> int:
     asked = parser.parse_args()
     path, times, centers_m, rotations = path_and_truth(asked.data, asked.model)
     at_s, at_m = true_antenna(path, times, centers_m, rotations(times).as_matrix())
-    assert path.timestamps_s is not None
-    true_m = interpolated(times, centers_m, path.timestamps_s)
+    true_m = interpolated(times, centers_m, path.times_s)
     is_known = np.isfinite(true_m).all(axis=1)
     true_scale = align_points(path.centers[is_known], true_m[is_known]).scale
     model = pycolmap.Reconstruction(asked.model)

@@ -72,7 +72,7 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
     bins = ranges.bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))
-    components = radio_components(bins)
+    components = radio_components(bins, posed.curve_stddev_m)
     given = (bins.mean(off_m), bins.mean(nothing_open), np.ones((1, 1)), solution.noise_stddev_m)
     learned = learn_errors(components, bins, *given)
     return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))

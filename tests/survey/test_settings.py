@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from rangesfm.mapper_options import MapperOptions
 from rangesfm.measurements.ranges.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.options import OutputOptions
 from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_reader import input_paths, read_survey, survey_from_tables
+from rangesfm.survey.survey_reader import NO_OVERRIDES, input_paths, read_survey, survey_from_tables
 
 WHOLE = """
 [images]
@@ -74,7 +75,7 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def refusal(path: Path, overrides: dict[str, object] | None = None) -> InputError:
+def refusal(path: Path, overrides: Mapping[str, object] = NO_OVERRIDES) -> InputError:
     with pytest.raises(InputError) as caught:
         read_survey(path, overrides)
     assert "\n" not in str(caught.value)

@@ -49,7 +49,7 @@ class SurveyRow:
     output_path: str = ""
     figures: Mapping[str, Any] = field(default_factory=lambda: dict.fromkeys(_FIGURES))
     stage: str = ""
-    num_done: int | None = None
+    num_done: int = 0
     num_total: int = 0
     began_s: float | None = None
 
@@ -163,10 +163,10 @@ class BatchState:
         if "began_on" in message:
             row.status, row.host, row.began_s = "running", message["began_on"], self._clock()
             row.num_attempts += 1
-            row.stage, row.num_done, row.num_total = "", None, 0
+            row.stage, row.num_done, row.num_total = "", 0, 0
             self.num_at_once = max(self.num_at_once, self.num("running"))
         elif "stage" in message:
-            row.stage, row.num_done, row.num_total = message["stage"], None, 0
+            row.stage, row.num_done, row.num_total = message["stage"], 0, 0
         elif "num_done" in message:
             row.num_done, row.num_total = message["num_done"], message["num_total"]
 

@@ -156,7 +156,7 @@ def _going_on(batch_state: BatchState) -> list[str]:
     lines = []
     for row in batch_state.rows:
         if row.began_s is not None:
-            counted = "" if row.num_done is None else f" {counts(row.num_done, row.num_total)}"
+            counted = f" {counts(row.num_done, row.num_total)}" if row.num_done or row.num_total else ""
             lines.append(f"  {_stage(row)}{counted}, {format_duration(batch_state.seconds_running(row))}")
     return [*lines[:_MAX_NUM_LINES], _summary(batch_state)]
 

@@ -191,6 +191,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
+    from rangesfm.comparison.model_ranges import NO_RANGES
     from rangesfm.measurements.lengths.tape import Tape
     from rangesfm.measurements.lengths.tape_file import read_markers, read_tape
     from rangesfm.measurements.positions.true_positions import read_true_positions
@@ -204,7 +205,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     survey = survey_from_arguments(args)
-    models, ranges, tape = read_named_models(paths, survey), None, Tape()
+    models, ranges, tape = read_named_models(paths, survey), NO_RANGES, Tape()
     if survey.ranges.path is not None:
         model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model.num_images())
         ranges = ranges_of_survey(survey, model, path)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, rms
 from rangesfm.colmap.model_files import read_model
-from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
+from rangesfm.comparison.model_ranges import NO_RANGES, ModelRanges, ranges_of_result
 from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
 from rangesfm.errors import InputError
@@ -32,7 +32,7 @@ from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
-_NO_RANGES = (math.nan, math.nan)
+_NOT_KNOWN = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def _result_around(path: Path) -> ResultFolder | None:
 
 def compare_many(
     models: Sequence[NamedModel],
-    ranges: ModelRanges | None = None,
+    ranges: ModelRanges = NO_RANGES,
     tape: Tape = Tape(),
     reference: Reference = NO_REFERENCE,
 ) -> ModelsComparison:
@@ -207,7 +207,7 @@ def compare_many(
 
     Args:
         models: to compare.
-        ranges: with which to compare the models; None: those of the first result folder among the models, if any.
+        ranges: with which to compare the models; without any, those of the first result folder among the models.
         tape: taped distances to measure in each model.
         reference: true positions.
 
@@ -215,19 +215,17 @@ def compare_many(
         InputError: a model has no photo in common with the first, or lacks an end of a taped distance; or the reference
             has no keyframe of a model, or is by time and the times of its photos are not known.
     """
-    own = [ranges or (ranges_of_result(one.result, one.path) if one.result else None) for one in models]
-    ranges = next(filter(None, own), None)
-    onto_ranges: list[Similarity | None] = [None] * len(models)
-    if ranges is not None:
-        common = (common_photos(ranges.metric_path, model.path) for model in models)
-        onto_ranges = [similarity_onto(source, target) for _, target, source in common]
+    own = [ranges or (ranges_of_result(one.result, one.path) if one.result else NO_RANGES) for one in models]
+    ranges = next(filter(None, own), NO_RANGES)
+    common = (common_photos(ranges.metric_path, model.path) for model in models)
+    onto_ranges = [similarity_onto(source, target) for _, target, source in common]
     rows = []
     for model, own_ranges, onto in zip(models, own, onto_ranges, strict=True):
-        range_rms_m = _NO_RANGES
-        if ranges is not None and onto is not None and model.has_orientations:
+        range_rms_m = _NOT_KNOWN
+        if onto is not None and model.has_orientations:
             as_it_is = rms((own_ranges or ranges).residuals_m(model.path))
             carried = rms(ranges.residuals_m(carried_by(onto, model.path)))
-            range_rms_m = _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
+            range_rms_m = _NOT_KNOWN if np.isnan(as_it_is) else (as_it_is, carried)
         rows.append(_row(models[0], model, range_rms_m))
     taped = _taped(models, ranges, onto_ranges, tape)
     truth = [_truth_cells(model, reference) for model in models] if len(reference) else []
@@ -280,14 +278,14 @@ def _row(base: NamedModel, other: NamedModel, range_rms_m: tuple[float, float]) 
 
 
 def _taped(
-    models: Sequence[NamedModel], ranges: ModelRanges | None, onto_ranges: Sequence[Similarity | None], tape: Tape
+    models: Sequence[NamedModel], ranges: ModelRanges, onto_ranges: Sequence[Similarity | None], tape: Tape
 ) -> dict[tuple[str, str], list[float]]:
     """Return ``ModelsComparison.taped``.
 
     Raises:
         InputError: an end of a distance is not in a model.
     """
-    anchors_m = {} if ranges is None else ranges.anchors_m
+    anchors_m = ranges.anchors_m
     places = np.array(list(anchors_m.values())).reshape(-1, 3)
     lengths, lengths_m = (np.full((len(models), len(tape.distances)), np.nan) for _ in range(2))
     for k, (model, onto) in enumerate(zip(models, onto_ranges, strict=True)):
@@ -301,7 +299,7 @@ def _taped(
         lengths[k] = located.lengths_m(1.0, places)
         if onto is not None:
             lengths_m[k] = located.lengths_m(onto.scale, places)
-    both = lengths if ranges is None else np.vstack([lengths, lengths_m])
+    both = np.vstack([lengths, lengths_m]) if ranges else lengths
     return {taped.ends: [taped.distance_m, *both[:, k].tolist()] for k, taped in enumerate(tape.distances)}
 
 

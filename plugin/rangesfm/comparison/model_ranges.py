@@ -39,6 +39,9 @@ class ModelRanges:
     metric_path: Trajectory
     association: RangesOptions
 
+    def __len__(self) -> int:
+        return len(self.log)
+
     def residuals_m(self, path: Trajectory) -> Array:
         """Return predicted minus measured ranges, (k,) metres, of the k ranges with a place on a metric path."""
         timed = path.timed(self.image_times_s) if self.image_times_s else path
@@ -51,8 +54,12 @@ class ModelRanges:
         return np.asarray((at.predicted_m(IDENTITY, anchors, biases) - self.log.range_m)[at.has_place])
 
 
-def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRanges | None:
-    """Return the ranges that a run used, its anchors and their biases; None for a result without ranges.
+_NOWHERE = Trajectory(np.zeros(0, dtype=np.int64), (), None, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NO_RANGES = ModelRanges(RangeLog.from_arrays([], []), {}, {}, {}, {}, _NOWHERE, RangesOptions())
+
+
+def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRanges:
+    """Return the ranges that a run used, its anchors and their biases; none for a result without ranges.
 
     Args:
         result: of the run.
@@ -60,7 +67,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     """
     ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
     if not ranges:
-        return None
+        return NO_RANGES
     before, after, has_place = ranges.places_on(metric_path.image_names)
     rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
     # Times of the ranges by the clock of the camera, or names of photos where these have no times.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import pycolmap
 
@@ -100,8 +101,8 @@ def export_model(
     formats: Iterable[str],
     output_path: AnyPath,
     *,
-    timestamps_s: Mapping[str, float] | None = None,
-    anchors_m: Mapping[str, Array] | None = None,
+    timestamps_s: Mapping[str, float] = MappingProxyType({}),
+    anchors_m: Mapping[str, Array] = MappingProxyType({}),
     metric_from_sfm: Similarity | None = None,
 ) -> tuple[Path, ...]:
     """Write a metric model in several formats.
@@ -120,7 +121,7 @@ def export_model(
     Raises:
         InputError: a format is unknown or needs something that is not given, or the folder cannot be written to.
     """
-    map_ = MetricMap(reconstruction, timestamps_s or {}, anchors_m or {}, metric_from_sfm)
+    map_ = MetricMap(reconstruction, timestamps_s, anchors_m, metric_from_sfm)
     return export_map(map_, Path(output_path), ExportOptions(formats=tuple(formats)))
 
 

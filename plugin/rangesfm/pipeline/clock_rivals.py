@@ -42,7 +42,7 @@ def by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Riv
         return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path, path.as_walk)
 
     found = list[Rivals]()
-    if offset is not None and offset.rivals:
+    if offset.rivals:
         found.append(scale_by_rivals(estimate, trajectory, offset, at_ranges_offset, "", TimedRanges.remedy))
     if track is not None and (search := track.offset) is not None and search.rivals:
         remedy = TimedPositions.remedy

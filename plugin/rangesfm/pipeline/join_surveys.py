@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.measurements.clock.offset import TimeOffset
+from rangesfm.measurements.clock.offset import NO_OFFSET
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
@@ -229,7 +229,7 @@ def paths_of_surveys(
         status = np.where(placed.has_place & (number != k), RangeStatus.OUTSIDE_PATH, placed.status).astype(np.int8)
         status[(status == RangeStatus.USED) & is_check] = RangeStatus.CHECK
         placed = replace(placed, status=status)
-        paths.append(PathOfModel(survey.name, survey.model, survey.path, placed, TimeOffset.given(0.0)))
+        paths.append(PathOfModel(survey.name, survey.model, survey.path, placed, NO_OFFSET))
     return paths
 
 

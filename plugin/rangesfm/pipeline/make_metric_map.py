@@ -77,7 +77,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, bending: MapBending, *, i
         GeometryError: the scale is not determined.
     """
     survey, inputs, offset = run.survey, run.inputs, path.time_offset
-    if offset is not None and offset.offset_matters:
+    if offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
     limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:

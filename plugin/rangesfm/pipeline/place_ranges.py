@@ -37,7 +37,7 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
         run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
     check_times(run, trajectory)
     offset = run.find_time_offset(trajectory)
-    offset_s = 0.0 if offset is None else offset.at(run.inputs.log.timestamp_s)
+    offset_s = offset.at(run.inputs.log.timestamp_s)
     paths = [PathOfModel("sparse/0", models[0], trajectory, run.ranges_on(trajectory, offset_s), offset)]
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):

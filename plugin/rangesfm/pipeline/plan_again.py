@@ -88,8 +88,7 @@ def with_advice(metric: MetricResult) -> MetricResult:
     trajectory = metric.trajectory.as_in(metric.final)
     arm = metric.inputs.tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
     try:
-        frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
-        stddevs = {} if learned is None else learned.stddev_of_component
+        frame, stddevs = _frame(estimate.frame, is_known=is_known), estimate.ranges.error_stddevs
         points_m = colored_points(metric.final)[0]
         site = Site(georeference=metric.inputs.site.georeference)
         learnt = metric.all_measured.problem.sizes

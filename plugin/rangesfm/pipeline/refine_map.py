@@ -68,7 +68,7 @@ def refine_closed_map(
 def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
     """Return the survey with the time offset to be estimated where it is not certain."""
     offset = metric.path.time_offset
-    if offset is None or offset.is_certain or run.survey.refine.time_offset_stddev_s:
+    if offset.is_certain or run.survey.refine.time_offset_stddev_s:
         return run
     return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
 

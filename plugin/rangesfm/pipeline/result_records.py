@@ -39,6 +39,7 @@ from rangesfm.result.result_tables import (
 )
 from rangesfm.result.summary import ResultSummary
 from rangesfm.solver.mistakes import RISK
+from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -100,7 +101,7 @@ def _model(model: ModelVerdict, metric_from_joined: Similarity) -> entries.Model
 
 def _time_offset(found: MetricResult) -> entries.TimeOffsetEntry:
     offset = found.path.time_offset
-    if offset is None:
+    if isinstance(found.observations.log.moments, ByPhoto):
         return entries.TimeOffsetEntry(value_s=None, stddev_s=None, estimated=False, note=None)
     if offset.is_given:
         return entries.TimeOffsetEntry(value_s=offset.value_s, stddev_s=0.0, estimated=False, note=None)
@@ -281,7 +282,7 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         kinds = {"closed": loops.closed, "contradicted": loops.contradicted}
         pairs = [(*pair, kind) for kind, of_kind in kinds.items() for pair in of_kind]
         yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
-    if (offset := found.path.time_offset) is not None and not offset.is_given:
+    if not (offset := found.path.time_offset).is_given:
         yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs)
     markers = found.inputs.tape.found_markers
     if markers:

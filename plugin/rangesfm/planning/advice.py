@@ -326,8 +326,7 @@ def _bent(path: Trajectory) -> tuple[Trajectory, float]:
 
 def _there_and_back(path: Trajectory, num: int) -> Trajectory:
     """Return a path that is walked several times, every second time backwards, with the same directions of view."""
-    times, last = path.timestamps_s, len(path) - 1
-    assert times is not None
+    times, last = path.times_s, len(path) - 1
     order = np.arange(num * last + 1) % (2 * last)
     order = np.where(order > last, 2 * last - order, order)
     steps_s = np.abs(np.diff(times[order]))
@@ -343,7 +342,6 @@ def _there_and_back(path: Trajectory, num: int) -> Trajectory:
 
 def _wider(path: Trajectory, factor: float) -> Trajectory:
     """Return a path spread out around its mean by a factor, walked at the same speed, with as many photos."""
-    times = path.timestamps_s
-    assert times is not None
+    times = path.times_s
     out = _farther_out(path, path.centers, factor)
     return replace(path, centers=out, timestamps_s=times[0] + factor * (times - times[0]))

@@ -42,8 +42,7 @@ class PlannedAntenna(Options, table="positions"):
 
     def located(self, path: Trajectory) -> KnownPositions:
         """Return the positions without errors on a path."""
-        assert path.timestamps_s is not None, "a planned path has times"
-        times_s = np.arange(path.timestamps_s[0], path.timestamps_s[-1], 1 / self.rate_hz)
+        times_s = np.arange(path.times_s[0], path.times_s[-1], 1 / self.rate_hz)
         covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
         nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
         log = PositionLog(nowhere, covariance_m2, ByTime(times_s), lines)

@@ -19,9 +19,9 @@ from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
-from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
-from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale, bins_on
 from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
 from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
@@ -91,7 +91,7 @@ def _observations(planned: PlannedSurvey) -> RangeObservations:
     places = associate(log, path, planned.tag_in_cam_m)
     at = _standing_m(planned)[[ids.index(anchor_id) for anchor_id in log.anchor_ids]]
     distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
-    curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
+    curve = np.full(len(log), np.nan if planned.curve_stddev_m is None else planned.curve_stddev_m)
     # A range without a position on the path is not used; it only needs a valid number.
     measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
     return replace(places, log=measured)
@@ -101,12 +101,12 @@ def turned_out(on_map: JointMap, seed: int) -> RangeObservations:
     """Return the planned ranges on a map with errors drawn from those to expect."""
     ranges = find_kind(on_map.kinds, RangeScale)
     assert ranges is not None, "a plan with ranges"
-    posed, learned, rng = ranges.posed, ranges.learnt(on_map), np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(learned.without("white").covariance_m2)
+    posed, noise, rng = ranges.posed, on_map.problem.noise_of(RANGES), np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(noise.without("white").covariance_m2)
     of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-    white_m = learned.stddev_of_component["white"] / np.sqrt(ranges.solution.fit.weights)
+    white_m = noise.stddev_of_component["white"] / np.sqrt(ranges.solution.fit.weights)
     range_m = posed.observations.log.range_m.copy()
-    range_m[posed.rows] += of_bins[learned.of_range] + white_m * rng.standard_normal(len(learned.of_range))
+    range_m[posed.rows] += of_bins[bins_on(on_map).of_range] + white_m * rng.standard_normal(len(posed.rows))
     log = replace(posed.observations.log, range_m=np.maximum(range_m, LENGTH_M.least))
     return replace(posed.observations, log=log)
 
@@ -140,7 +140,7 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     ranges = find_kind(on_map.kinds, RangeScale)
     if ranges is None:
         return ()
-    here, bins = ranges_on_map(ranges.posed, ranges.solution, ranges.bending), ranges.learnt(on_map).bins
+    here, bins = ranges_on_map(ranges.posed, ranges.solution, ranges.bending), bins_on(on_map)
     joint = joined([in_bins(here, bins, ranges.solution.noise_stddev_m, {}, np.zeros(len(bins)))], here.bending)
     problem = Linearized(**vars(joint), on_map=here, bins=bins, scatter_m=0.0)
     found = []

@@ -79,8 +79,7 @@ class PlannedSensor(Options, table="imu"):
         """
         if len(path) <= MIN_NUM_TURNS:
             raise GeometryError(f"{len(path)} photos do not tell how it sits, expected more than {MIN_NUM_TURNS}")
-        times_s, mounting = path.timestamps_s, Mounting(np.eye(3), np.zeros(3))
-        assert times_s is not None, "a planned path has times"
+        times_s, mounting = path.times_s, Mounting(np.eye(3), np.zeros(3))
         places, turns = (
             CubicSpline(times_s, path.centers),
             RotationSpline(times_s, Rotation.from_matrix(path.world_from_cam)),

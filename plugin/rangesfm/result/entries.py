@@ -98,7 +98,7 @@ class ScaleEntry(Record):
     relative_stddev: RelativeStddevEntry = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
     error_stddevs: dict[Text, Number] = Field(
         default_factory=dict,
-        validation_alias=AliasChoices("error_stddevs", AliasPath("errors", "learned", "stddev_of_component")),
+        validation_alias=AliasChoices("error_stddevs", AliasPath("ranges", "error_stddevs")),
     )
     """Learnt standard deviations of the components of the range errors: metres (slope: fraction of the distance)."""
     method: Text

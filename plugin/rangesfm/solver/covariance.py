@@ -30,7 +30,7 @@ def joint_covariance(
     anchors: Mapping[str, Array] = MappingProxyType({}),
     residual_stddev: float = 1.0,
     refined_params: Mapping[int, Sequence[int]] = MappingProxyType({}),
-    firm_frame_ids: Indices | None = None,
+    firm_frame_ids: Indices,
 ) -> MapErrors:
     """Compute the covariance of all parts of a map to first order: the inverse of the normal equations J^T J.
 
@@ -42,7 +42,7 @@ def joint_covariance(
         residual_stddev: standard deviation of the residuals: 1 if they are in standard deviations.
         refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
             here are adjusted as a whole or not at all.
-        firm_frame_ids: of the frames whose size is that of the map; None: all.
+        firm_frame_ids: of the frames whose size is that of the map.
 
     Raises:
         GeometryError: a block is not determined by the residuals, or next to rounding the map as a whole is not.
@@ -54,7 +54,7 @@ def joint_covariance(
         equations, inverse, blocks = _solved(equations.with_turns_bounded(residual_stddev))
     parts = [*_parts(equations, columns, anchors, refined_params)]
     steps = steps_of(parts, len(equations.gradient))
-    is_firm = np.isin(columns.frames, columns.frames if firm_frame_ids is None else firm_frame_ids)
+    is_firm = np.isin(columns.frames, firm_frame_ids)
     of_scale = _scale_gradient(columns, is_firm)
     with_scale = variance * inverse.solve(of_scale)[:, 0]
     by_scale, scale_m2 = steps.T @ with_scale, float(of_scale[:, 0] @ with_scale)

@@ -62,7 +62,7 @@ def parse_inline_table(text: str) -> dict[str, Any]:
 
 
 def read_survey(
-    path: AnyPath, overrides: Mapping[str, object] | None = None, base_folder: AnyPath | None = None
+    path: AnyPath, overrides: Mapping[str, object] = NO_OVERRIDES, base_folder: AnyPath | None = None
 ) -> Survey:
     """Read a survey file.
 
@@ -77,7 +77,7 @@ def read_survey(
     """
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent if base_folder is None else base_folder
-    return survey_from_tables(tables, folder, overrides or {}, source)
+    return survey_from_tables(tables, folder, overrides, source)
 
 
 def survey_from_tables(

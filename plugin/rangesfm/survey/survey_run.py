@@ -13,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.clock.offset import TimeOffset
+from rangesfm.measurements.clock.offset import NO_OFFSET, TimeOffset
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeKind
@@ -40,19 +40,19 @@ class PathOfModel:
         name: name for the user, such as "sparse/0".
         trajectory: path of its photos that have a time.
         observations: ranges on that path, from the log that all models share.
-        time_offset: with which the ranges were placed; None where the log names photos.
+        time_offset: with which the ranges were placed; 0 where the log names photos.
     """
 
     name: str
     sfm: pycolmap.Reconstruction
     trajectory: Trajectory
     observations: RangeObservations
-    time_offset: TimeOffset | None = None
+    time_offset: TimeOffset = NO_OFFSET
 
     @property
-    def offset_s(self) -> float | Array:
-        """Image time minus time of the log: (n,) for its ranges, or 0 where it names photos."""
-        return 0.0 if self.time_offset is None else self.time_offset.at(self.observations.log.timestamp_s)
+    def offset_s(self) -> Array:
+        """Image time minus time of the log: (n,) for its ranges, NaN where it names photos."""
+        return self.time_offset.at(self.observations.log.timestamp_s)
 
     @property
     def as_walk(self) -> WalkBending:
@@ -91,19 +91,19 @@ class SurveyRun:
             self.journal.warn(*told_unknown(what, listed, photos, where))
         return replace(self, inputs=self.inputs.with_photos(photos))
 
-    def find_time_offset(self, trajectory: Trajectory) -> TimeOffset | None:
+    def find_time_offset(self, trajectory: Trajectory) -> TimeOffset:
         """Return the time offset between the clocks, which is searched for if it is not given.
 
-        None where the log names photos.
+        It is 0 where the log names photos.
 
         Raises:
             GeometryError: the ranges do not determine it.
         """
         inputs, survey = self.inputs, self.survey
+        if isinstance(inputs.log.moments, ByPhoto):
+            return NO_OFFSET
         if survey.ranges.time_offset_s is not None:
             return TimeOffset.given(survey.ranges.time_offset_s)
-        if isinstance(inputs.log.moments, ByPhoto):
-            return None
         with self.journal.stage("time offset"):
             offset = estimate_time_offset(
                 inputs.log,

@@ -474,7 +474,7 @@ def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
 
 def no_ranges() -> RangeObservations:
     none, no, nowhere = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
-    log = RangeLog((), none, no, ByPhoto(()), no, (), none, none, np.zeros(0, dtype=np.int8), none)
+    log = RangeLog((), none, no, ByPhoto(()), no, no, (), none, none, np.zeros(0, dtype=np.int8), none)
     status = np.zeros(0, dtype=np.int8)
     return RangeObservations(log, status, none, none, no, nowhere, nowhere, nowhere, no, no)
 

@@ -144,7 +144,7 @@ def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSur
     short_m, off = [], []
     for error in (0 * true, -0.4 * np.exp(-true / 1.0)):
         estimate = survey.scale("unknown", (), survey.log_with(true + noise + error))
-        short_m.append(known(estimate.errors.learned).stddev_of_component["short"])
+        short_m.append(estimate.ranges.error_stddevs["short"])
         off.append(abs(survey.relative_error(estimate)) / estimate.uncertainty.half_width_95)
     assert short_m[1] > short_m[0]
     assert max(off) < 1

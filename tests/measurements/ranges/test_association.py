@@ -286,16 +286,6 @@ class TestLogsThatNamePhotos:
         assert np.isnan(found.centers[1]).all()
 
 
-def test_ranges_to_anchors_that_nobody_wants_keep_their_place_and_are_told() -> None:
-    keyframe_times = np.arange(0.0, 5.0)
-    path = trajectory_of(keyframe_times, straight(keyframe_times))
-    log = log_at([0.5, 1.5, 2.5, 9.0], anchor_ids=("A", "B"))
-    found = associate(log, path, TAG_IN_CAM_M, anchor_ids=["B"])
-    assert statuses(found) == ["unknown-anchor", "used", "unknown-anchor", "outside-path"]
-    np.testing.assert_allclose(found.centers[0], straight(np.array([0.5]))[0], atol=1e-12)
-    assert found.has_place.tolist() == [False, True, False, False]
-
-
 def test_each_tag_has_its_own_lever_arm() -> None:
     keyframe_times = np.arange(0.0, 5.0)
     turned = Rotation.from_rotvec(np.outer(keyframe_times, [0.0, 0.0, 0.3]))

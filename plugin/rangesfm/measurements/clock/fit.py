@@ -210,19 +210,16 @@ class OffsetFit:
         """Return whether there are enough observations to tell a fit from a coincidence."""
         return self.num_spare >= self.num_unknowns
 
-    def losses(self, stddev: float | None = None) -> Array:
-        """Return the negative log-likelihood of each residual (n,), up to a constant.
-
-        Args:
-            stddev: of the residuals; None: their own.
-        """
-        return _losses(self.residuals, self.residual_stddev if stddev is None else stddev)
+    def losses(self, stddev: float) -> Array:
+        """Return the negative log-likelihood of each residual (n,) of this standard deviation, up to a constant."""
+        return _losses(self.residuals, stddev)
 
     @cached_property
     def gains(self) -> Array:
         """Gain in each number's log-likelihood over a camera that stands still (n,)."""
         deviations = self.observed.deviations
-        return _losses(deviations, self.observed.residual_stddev(deviations)) - self.losses()
+        own = self.losses(self.residual_stddev)
+        return _losses(deviations, self.observed.residual_stddev(deviations)) - own
 
     @property
     def score(self) -> float:
@@ -235,7 +232,7 @@ class OffsetFit:
 
         It is found from the variation of the losses between blocks of time, which is larger for correlated errors.
         """
-        losses = self.losses()
+        losses = self.losses(self.residual_stddev)
         variance = _variance_of_mean(losses, self.times_s)
         return min(self.num_spare, float(np.var(losses)) / max(variance, 1e-300))
 

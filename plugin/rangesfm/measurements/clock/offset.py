@@ -119,3 +119,6 @@ class TimeOffset:
         """Return the offsets (n,) at times (n,) of the log's clock."""
         drift = self.drift if self.drift_is_followed else 0.0
         return self.value_s + drift * (times_s - self.reference_s)
+
+
+NO_OFFSET = TimeOffset.given(0.0)

@@ -95,7 +95,7 @@ def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: Range
     Raises:
         GeometryError: poses can be interpolated nowhere.
     """
-    keyframes_s = _times(trajectory)
+    keyframes_s = trajectory.times_s
     start_s, step_s, num = _steps(keyframes_s, 0.0)
     times_s: Array = start_s + step_s * np.arange(num, dtype=np.float64)
     gap_s = max(_MAX_GAPS * float(np.median(np.diff(keyframes_s))), options.max_interpolation_gap_s)
@@ -115,18 +115,13 @@ def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: Range
 
 def standing_path(trajectory: Trajectory, antennas_in_cam_m: Array, reach_s: float) -> PathSamples:
     """Sample the path of a camera that stands still from ``reach_s`` before to as long after each keyframe."""
-    keyframes_s = _times(trajectory)
+    keyframes_s = trajectory.times_s
     start_s, step_s, num = _steps(keyframes_s, reach_s)
     times_s: Array = start_s + step_s * np.arange(num, dtype=np.float64)
     nearest = keyframes_around(times_s, keyframes_s).nearest
     is_known = np.abs(times_s - keyframes_s[nearest]) <= reach_s
     arms_m = np.einsum("nij,aj->ani", trajectory.world_from_cam[nearest], antennas_in_cam_m)
     return PathSamples(start_s, step_s, trajectory.centers[nearest], arms_m, is_known)
-
-
-def _times(trajectory: Trajectory) -> Array:
-    assert trajectory.timestamps_s is not None, "a path in time needs times"
-    return trajectory.timestamps_s
 
 
 def _steps(keyframes_s: Array, beyond_s: float) -> tuple[float, float, int]:

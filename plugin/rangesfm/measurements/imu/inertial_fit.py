@@ -138,8 +138,7 @@ class InertialProblem:
     @property
     def times_s(self) -> Array:
         """(n,) times of the photos."""
-        assert self.path.timestamps_s is not None, "photos have times"
-        return self.path.timestamps_s
+        return self.path.times_s
 
     @property
     def first_state(self) -> InertialState:

@@ -84,13 +84,16 @@ class Preintegrated:
         return turn, self.speed + change[:, SPEED], self.shift + change[:, SHIFT]
 
 
+_WITHOUT_ERRORS, _WITHOUT_NOISE = np.zeros(NUM_OF_SENSOR), np.zeros(2)
+
+
 def preintegrate(
     timestamp_s: Array,
     gyro_rad_s: Array,
     accel_m_s2: Array,
     photo_s: Array,
-    sensor: Array | None = None,
-    densities: Array | None = None,
+    sensor: Array = _WITHOUT_ERRORS,
+    densities: Array = _WITHOUT_NOISE,
 ) -> Preintegrated:
     """Sum up a log between neighbouring photos, by the midpoint rule.
 
@@ -99,12 +102,12 @@ def preintegrate(
     Args:
         timestamp_s, gyro_rad_s, accel_m_s2: (m,), (m, 3), (m, 3) of the log, at least two samples.
         photo_s: (n,) times of the photos on the sensor's clock, in any order of equal or rising times.
-        sensor: (19,) or (n - 1, 19) numbers of the sensor; None: 0.
-        densities: (2,) noise densities with which a turn must be known; None: only gaps count.
+        sensor: (19,) or (n - 1, 19) numbers of the sensor.
+        densities: (2,) noise densities with which a turn must be known; without noise only gaps count.
     """
     samples, log = np.column_stack([gyro_rad_s, accel_m_s2]), np.asarray(timestamp_s, dtype=np.float64)
     num = max(len(photo_s) - 1, 0)
-    sensors = np.broadcast_to(np.zeros(NUM_OF_SENSOR) if sensor is None else sensor, (num, NUM_OF_SENSOR))
+    sensors = np.broadcast_to(sensor, (num, NUM_OF_SENSOR))
     # Samples were taken later than their times say.
     late = sensors[:, CLOCK]
     starts, ends = photo_s[:-1] - late[:, 0], photo_s[1:] - late[:, 0]
@@ -119,7 +122,7 @@ def preintegrate(
         rows, rows + 1, (ends - starts)[rows], sums.turn, sums.speed, sums.shift, np.array(sensors[rows]),
         sums.with_clock(), sums.covariance[:2], sums.covariance[2],
     )  # fmt: skip
-    variances = found.covariance(np.zeros(2) if densities is None else densities)[:, TURN, TURN]
+    variances = found.covariance(densities)[:, TURN, TURN]
     is_known = np.linalg.eigvalsh(variances)[:, -1] <= _MAX_TURN_STDDEV_RAD**2
     return found.subset(np.flatnonzero(is_known))
 

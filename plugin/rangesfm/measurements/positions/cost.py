@@ -174,7 +174,7 @@ class AntennaPositions(Measurements):
         scaled = shown.weights.whitened(residual)
         weights = np.repeat(self.loss.weights(np.linalg.norm(scaled, axis=1)), 3)
         groups = (3 * self.group[:, None] + np.arange(3)).ravel()
-        return replace(shown, inflation=correlation_inflation(scaled.ravel(), weights, groups))
+        return replace(shown, inflation=correlation_inflation(scaled.ravel(), weights, groups, np.ones(scaled.size)))
 
     def _shown(self, residual: Array, num_absorbed: float) -> float:
         """Return the factor of the standard deviations that residuals show; arguments as for ``with_noise_of``."""

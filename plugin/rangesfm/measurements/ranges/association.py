@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +35,6 @@ def associate(
     *,
     time_offset_s: float | Array = 0.0,
     options: RangesOptions = RangesOptions(),
-    anchor_ids: Collection[str] | None = None,
 ) -> RangeObservations:
     """Find the camera pose at which each range was taken.
 
@@ -52,7 +50,6 @@ def associate(
         tag_in_cam_m: (3,) lever arm, the antenna in the camera (rig) frame, metres; (num_tags, 3) if the tags of
             ``log.tag_ids`` have their own.
         time_offset_s: image time = range time + offset; (n,) where the clocks drift.
-        anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all anchors are wanted.
 
     Returns:
         All n ranges, each with a position on the path, or a status that says why it has none. Ranges between two
@@ -73,12 +70,9 @@ def associate(
         status[at.before < 0] = elsewhere[at.before < 0]
     else:
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)
-    if anchor_ids is not None:
-        unwanted = [index for index, anchor_id in enumerate(log.anchor_ids) if anchor_id not in anchor_ids]
-        status[(status == RangeStatus.USED) & np.isin(log.anchor_index, unwanted)] = RangeStatus.UNKNOWN_ANCHOR
     status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
     status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
-    placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
+    placed = status == RangeStatus.USED
     at = at.moved(~placed, -1)
     # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
@@ -204,8 +198,7 @@ def _interpolated_centers(trajectory: Trajectory, at: OnPath, is_bridged: Mask) 
 
     Also returns the standard deviation (n,) of each coordinate.
     """
-    assert trajectory.timestamps_s is not None, "a motion in time needs times"
-    motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
+    motion = learn_motion(trajectory.times_s, trajectory.centers, is_bridged)
     offsets, stddev = np.zeros((len(at.before), 3)), np.full(len(at.before), motion.noise_stddev)
     between = at.fraction > 0
     offsets[between], stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])
@@ -220,10 +213,9 @@ def _interpolated_lever_arms(
     The rotation vectors from keyframe to keyframe, in the camera's frame, are summed up and treated as coordinates of a
     motion. This is valid while successive rotations are small or have the same axis.
     """
-    assert trajectory.timestamps_s is not None, "a motion in time needs times"
     to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
     turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
-    motion = learn_motion(trajectory.timestamps_s, turned, is_bridged)
+    motion = learn_motion(trajectory.times_s, turned, is_bridged)
     stddev = np.full(len(at.before), motion.noise_stddev)
     between = at.fraction > 0
     beyond, stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])

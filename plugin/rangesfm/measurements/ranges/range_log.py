@@ -43,6 +43,8 @@ class RangeLog:
         range_m: (n,) ranges in metres, finite and positive.
         moments: when the n ranges were taken: by time on the radio's clock, in any order, or by photo.
         range_stddev_m: (n,) standard deviation in metres, NaN where the log does not give it.
+        shared_stddev_m: (n,) standard deviation of the error that all ranges of about this length share after the
+            radio's error curve has been subtracted; NaN if it has not been.
         tag_ids: the distinct tags in natural order.
         tag_index: (n,) int, index in ``tag_ids``; -1 for a range between two anchors.
         peer_index: (n,) int, the other end of a range between two anchors (index in ``anchor_ids``) or two tags (index
@@ -53,8 +55,6 @@ class RangeLog:
         format: name of the reader.
         num_no_measurement: number of records that contain no measurement.
         notes: assumptions made in reading the file, as lines for the user.
-        shared_stddev_m: (n,) standard deviation of the error that all ranges of about this length share after the
-            radio's error curve has been subtracted; None if it has not been.
     """
 
     anchor_ids: tuple[str, ...]
@@ -62,6 +62,7 @@ class RangeLog:
     range_m: Array
     moments: Moments
     range_stddev_m: Array
+    shared_stddev_m: Array
     tag_ids: tuple[str, ...]
     tag_index: Indices
     peer_index: Indices
@@ -71,11 +72,11 @@ class RangeLog:
     format: str = "memory"
     num_no_measurement: int = 0
     notes: tuple[str, ...] = ()
-    shared_stddev_m: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.range_m)
-        for name in ("moments", "anchor_index", "range_stddev_m", "tag_index", "peer_index", "los", "line"):
+        of_ranges = ("moments", "range_stddev_m", "shared_stddev_m", "los", "line")
+        for name in ("anchor_index", "tag_index", "peer_index", *of_ranges):
             if len(getattr(self, name)) != n:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, range_m has {n}")
         if not (np.all(np.isfinite(self.range_m)) and np.all(self.range_m > 0)):
@@ -267,6 +268,7 @@ class RangeLog:
             range_m=np.asarray(range_m, np.float64),
             moments=ByTime(times_s) if len(times_s) else ByPhoto(photos),
             range_stddev_m=np.full(n, np.nan) if range_stddev_m is None else np.asarray(range_stddev_m, np.float64),
+            shared_stddev_m=np.full(n, np.nan),
             tag_ids=tag.names,
             tag_index=tag.index,
             peer_index=np.full(n, -1),

@@ -67,7 +67,7 @@ def off_origin(centers: Array) -> Mask:
     return is_off
 
 
-def align_points(source: Array, target: Array, *, with_scale: bool = True, weights: Array | None = None) -> Similarity:
+def align_points(source: Array, target: Array, *, with_scale: bool = True, weights: Array | float = 1.0) -> Similarity:
     """Return the similarity (or rigid motion) target_from_source with the least squared error.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
@@ -76,9 +76,10 @@ def align_points(source: Array, target: Array, *, with_scale: bool = True, weigh
     Args:
         source, target: (n, 3) corresponding points, n >= 3 for a unique answer.
         with_scale: False keeps the scale at 1. The scale is also 1 if all source points are in one place.
-        weights: (n,) of the squared errors; None: equal.
+        weights: (n,) of the squared errors, or one number for all.
     """
-    w = np.ones(len(source)) / len(source) if weights is None else weights / weights.sum()
+    w = np.broadcast_to(weights, len(source))
+    w = w / w.sum()
     mean_source, mean_target = w @ source, w @ target
     centered_source, centered_target = source - mean_source, target - mean_target
     u, singular_values, vt = np.linalg.svd((centered_target * w[:, None]).T @ centered_source)

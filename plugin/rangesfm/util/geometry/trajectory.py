@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import InputError
 from rangesfm.util.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
@@ -54,6 +55,17 @@ class Trajectory:
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
         """Return the path of the same keyframes in another model."""
         return trajectory_from_reconstruction(model, self.times_by_name or None)
+
+    @property
+    def times_s(self) -> Array:
+        """The ``timestamps_s`` of a path that must have them.
+
+        Raises:
+            InputError: it has none.
+        """
+        if self.timestamps_s is None:
+            raise InputError("the photos have no times: give image times")
+        return self.timestamps_s
 
     @property
     def times_by_name(self) -> dict[str, float]:

@@ -49,7 +49,6 @@ def test_ranges_beyond_its_ends_are_counted_for_the_user() -> None:
         "50 % of the ranges are shorter or longer than the 1.00 to 4.00 m at which the error curve was learnt: "
         "they weigh less"
     ]
-    assert corrected.shared_stddev_m is not None
     assert corrected.subset(np.arange(5, 10)).shared_stddev_m == pytest.approx(corrected.shared_stddev_m[5:])
     assert correct_ranges(log.subset(np.arange(5)), CURVE)[1] == []
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from rangesfm.measurements.ranges.errors.components import COMPONENTS
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
+from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, range_bins
-from rangesfm.solver.noise import ComponentLikelihood, learnt_sizes, usual_sizes
+from rangesfm.solver.noise import Component, ComponentLikelihood, Noise, learnt_sizes, usual_sizes
 
 Array = npt.NDArray[np.float64]
 
@@ -40,18 +40,22 @@ def walked() -> RangeBins:
     )
 
 
+def uncalibrated(of: RangeBins) -> tuple[Component, ...]:
+    return radio_components(of, np.full(len(of), np.nan))
+
+
 def learnt(
-    of: RangeBins, off_m: Array, design: Array, prior: Array, noise_m: float, curve_stddev_m: Array | None = None
-) -> LearnedErrors:
-    components = radio_components(of, curve_stddev_m)
+    of: RangeBins, off_m: Array, design: Array, prior: Array, noise_m: float, curve_stddev_m: float = np.nan
+) -> Noise:
+    components = radio_components(of, np.full(len(off_m), curve_stddev_m))
     return learn_errors(components, of, of.mean(off_m), of.mean(design), prior, noise_m)
 
 
-def learn(of: RangeBins, off_m: Array) -> LearnedErrors:
+def learn(of: RangeBins, off_m: Array) -> Noise:
     return learnt(of, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.05)
 
 
-def stddevs(learned: LearnedErrors) -> dict[str, float]:
+def stddevs(learned: Noise) -> dict[str, float]:
     return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
 
 
@@ -101,7 +105,7 @@ def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be
 
 def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: RangeBins) -> None:
     off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
-    found, usual = stddevs(learn(walked, off_m)), usual_sizes(radio_components(walked))
+    found, usual = stddevs(learn(walked, off_m)), usual_sizes(uncalibrated(walked))
     assert found.pop("white") == pytest.approx(0.05, rel=0.15)
     for name, stddev in found.items():
         assert stddev < 1.2 * usual[name], name
@@ -111,7 +115,7 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     slope = next(each for each in COMPONENTS if each.name == "slope")
     of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
     expected = np.sqrt(np.mean(of_radios**2))
-    assert usual_sizes(radio_components(walked))["slope"] == pytest.approx(expected, rel=0.02)
+    assert usual_sizes(uncalibrated(walked))["slope"] == pytest.approx(expected, rel=0.02)
     distance_m = walked.distance_m[walked.of_range]  # a free scale absorbs all of it
     scaled_free = learnt(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
@@ -119,14 +123,14 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
 
 def test_errors_are_learnt_alike_from_a_start_nearby(walked: RangeBins) -> None:
     off_m = 0.1 * np.random.default_rng(2).standard_normal(len(walked))
-    given = (radio_components(walked), off_m, np.zeros((len(walked), 1)), NO_MAP)
+    given = (uncalibrated(walked), off_m, np.zeros((len(walked), 1)), NO_MAP)
     sizes = learnt_sizes(*given)
     assert learnt_sizes(*given, near=sizes) == pytest.approx(sizes, rel=1e-3)
 
 
 def test_a_learnt_curve_counts_as_it_is_stated(walked: RangeBins) -> None:
     off_m = 0.02 * np.random.default_rng(3).standard_normal(len(walked))
-    learned = learnt(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
+    learned = learnt(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, 0.03)
     assert learned.names[-1] == "learnt_curve"
     np.testing.assert_allclose(np.diag(learned.covariances_m2[-1]), 0.03**2)
 

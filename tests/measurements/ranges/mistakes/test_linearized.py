@@ -72,7 +72,7 @@ def small_map(
             on_path=lambda rows: OnPath(points[rows], points[rows] + 1, np.zeros(len(rows))),
         ),
         rows=np.arange(num),
-        curve_stddev_m=None,
+        curve_stddev_m=np.full(num, np.nan),
         placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         site=Site(),
         trajectory=range(int(points.max()) + 2),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -34,14 +35,14 @@ LOCAL_M = 500.0
 
 
 def read_anchors(
-    path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+    path: AnyPath, *, columns: Mapping[str, str] = MappingProxyType({}), unit: str | None = None
 ) -> tuple[Anchor, ...]:
     """Read the anchors in a file; see ``read_anchor_list``."""
     return read_anchor_list(path, columns=columns, unit=unit)[0]
 
 
 def read_anchor_list(
-    path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+    path: AnyPath, *, columns: Mapping[str, str] = MappingProxyType({}), unit: str | None = None
 ) -> tuple[tuple[Anchor, ...], tuple[str, ...]]:
     """Read ``anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]``, or another table of points.
 
@@ -51,8 +52,8 @@ def read_anchor_list(
 
     Args:
         path: the file.
-        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; None:
-            recognized.
+        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names;
+            without any they are recognized.
         unit: unit of the coordinates, "m", "cm", "mm" or "ft"; None: that in the names of the columns, else metres.
 
     Returns:

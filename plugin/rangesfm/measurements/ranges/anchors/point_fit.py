@@ -154,12 +154,12 @@ def known_directions(problem: RangeProblem) -> list[Array]:
     return [*np.eye(columns.num)[[columns.scale, *known]]]
 
 
-def fit_with_own_noise(problem: RangeProblem, curve_stddev_m: Array | None, given_m: Array) -> PointFit:
+def fit_with_own_noise(problem: RangeProblem, curve_stddev_m: Array, given_m: Array) -> PointFit:
     """Fit an anchor and estimate the noise from its residuals, until both agree; given noise is a lower bound.
 
     Args:
         problem: as in ``PointFit``; its standard deviations are not used.
-        curve_stddev_m: (n,) of a learnt error curve that was subtracted; None if none was.
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted; NaN if none was.
         given_m: (n,) noise of each range, NaN where it is unknown.
     """
     is_given = np.isfinite(given_m)
@@ -297,9 +297,7 @@ class JudgedFit:
         return replace(problem, stddev_m=inflation * problem.stddev_m, bias_stddev_m=bias_stddev_m)
 
 
-def judged_fits(
-    fits: Sequence[PointFit], times_s: Array, tag_index: Indices, curve_stddev_m: Array | None
-) -> list[JudgedFit]:
+def judged_fits(fits: Sequence[PointFit], times_s: Array, tag_index: Indices, curve_stddev_m: Array) -> list[JudgedFit]:
     """Learn the errors of the ranges from the residuals of all fits together.
 
     Args:
@@ -328,4 +326,4 @@ def judged_fits(
         noise_m=float(precision.mean() ** -0.5),
     )
     covariance = learned.covariance_m2
-    return [JudgedFit(fit, learned.of_range[anchor_index == k], covariance) for k, fit in enumerate(fits)]
+    return [JudgedFit(fit, bins.of_range[anchor_index == k], covariance) for k, fit in enumerate(fits)]

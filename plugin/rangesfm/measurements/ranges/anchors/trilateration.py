@@ -131,7 +131,7 @@ def trilaterate(
         range_stddev_m=given.get("range_stddev_m"),
     )
     (placement,) = trilaterate_anchors(
-        replace(log, shared_stddev_m=given.get("shared_stddev_m")),
+        replace(log, shared_stddev_m=given.get("shared_stddev_m", log.shared_stddev_m)),
         positions,
         toward={_ONE: given["toward"]} if "toward" in given else {},
         height_m={} if height_m is None else {_ONE: height_m},
@@ -214,14 +214,9 @@ def trilaterate_anchors(
     )
     if len(rows):
         given_m = np.where(np.isfinite(given_m), given_m, options.range_stddev_m or np.nan)
-        curve_m = None if log.shared_stddev_m is None else log.shared_stddev_m[rows]
+        curve_m = log.shared_stddev_m[rows]
         heard = np.unique(index)
-        fits = [
-            fit_with_own_noise(
-                problem.of_anchor(k), None if curve_m is None else curve_m[index == k], given_m[index == k]
-            )
-            for k in heard
-        ]
+        fits = [fit_with_own_noise(problem.of_anchor(k), curve_m[index == k], given_m[index == k]) for k in heard]
         by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if isinstance(log.moments, ByPhoto) else []
         times_s = np.concatenate(by_walk) if by_walk else log.timestamp_s[rows]
         found = dict(zip(heard.tolist(), judged_fits(fits, times_s, log.tag_index[rows], curve_m), strict=True))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -66,7 +66,7 @@ class RadioComponent:
         median: over radios, of its standard deviation in metres (``slope``: share of the distance).
         spread: standard deviation of the logarithm of that over radios.
         calibrated_median: the median after a learnt error curve was subtracted: the change from one day, mounting and
-            room to the next. None: the calibration makes no difference.
+            room to the next; as the median where the calibration makes no difference.
         is_of_anchor: whether it is independent for each anchor, and larger where the anchor's ranges are noisier.
         correlation: returns the (c, c) covariance of bins for a standard deviation of 1.
         words: description for people.
@@ -75,14 +75,18 @@ class RadioComponent:
     name: str
     median: float
     spread: float
-    calibrated_median: float | None
+    calibrated_median: float
     is_of_anchor: bool
     correlation: Callable[[RangeBins], Array]
     words: str
 
+    def calibrated(self, median: float) -> RadioComponent:
+        """Return the component with another median after a learnt error curve was subtracted."""
+        return replace(self, calibrated_median=median)
+
     def median_if(self, is_calibrated: bool) -> float:
         """Return the median, also after a learnt error curve was subtracted."""
-        return self.calibrated_median if is_calibrated and self.calibrated_median is not None else self.median
+        return self.calibrated_median if is_calibrated else self.median
 
 
 def _same(labels: Indices) -> Array:
@@ -143,9 +147,9 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioCompon
         correlation: Callable[[RangeBins], Array],
         *,
         is_of_anchor: bool = False,
-        calibrated_median: float | None = None,
     ) -> RadioComponent:
-        return RadioComponent(name, *expected[name], calibrated_median, is_of_anchor, correlation, words)
+        median, spread = expected[name]
+        return RadioComponent(name, median, spread, median, is_of_anchor, correlation, words)
 
     of_anchor = functools.partial(component, is_of_anchor=True)
     return (
@@ -164,22 +168,14 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioCompon
         ),
         of_anchor("bias", "constant range error of each anchor", lambda c: _same(c.anchor_index)),
         component("tag_bias", "constant range error of each tag", lambda c: _same(c.tag_index)),
-        component(
-            "common_bias", "constant error of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04
-        ),
-        component("short", "errors of short ranges", _short, calibrated_median=0.08),
-        component(
-            "curve",
-            "range errors that vary with the distance",
-            lambda c: _smooth(_log_distance(c)),
-            calibrated_median=0.02,
+        component("common_bias", "constant error of all ranges", lambda c: np.ones((len(c), len(c)))).calibrated(0.04),
+        component("short", "errors of short ranges", _short).calibrated(0.08),
+        component("curve", "range errors that vary with the distance", lambda c: _smooth(_log_distance(c))).calibrated(
+            0.02
         ),
         component(
-            "slope",
-            "range errors proportional to the distance",
-            lambda c: np.outer(c.distance_m, c.distance_m),
-            calibrated_median=0.003,
-        ),
+            "slope", "range errors proportional to the distance", lambda c: np.outer(c.distance_m, c.distance_m)
+        ).calibrated(0.003),
         of_anchor(
             "antenna",
             "each anchor's antenna by direction",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.errors.components import COMPONENTS, LEARNT_CURVE, OtherError
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
@@ -19,50 +20,22 @@ from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes
 _WIDENING_POWER = 1.5
 
 
-@dataclass(frozen=True)
-class LearnedErrors(Noise):
-    """Errors of c bins of ranges.
-
-    Attributes:
-        bins: of the ranges.
-        of_range: (n,) bin of each range; -1 for a range that did not take part.
-    """
-
-    bins: RangeBins
-    of_range: Indices
-
-    @classmethod
-    def from_noise(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
-        """Return the errors of bins."""
-        return cls(noise.names, noise.sizes, noise.covariances_m2, bins, bins.of_range)
-
-    def subset(self, rows: Indices) -> LearnedErrors:
-        """Return the errors of some of the ranges."""
-        return replace(self, of_range=self.of_range[rows])
-
-    def spread(self, rows: Indices, num: int) -> LearnedErrors:
-        """Return the errors as ``rows`` of ``num`` ranges; the others do not take part."""
-        of_range = np.full(num, -1, dtype=np.int64)
-        of_range[rows] = self.of_range
-        return replace(self, of_range=of_range)
-
-
 def radio_components(
     bins: RangeBins,
-    curve_stddev_m: Array | None = None,
+    curve_stddev_m: Array,
     ruled_out: Collection[str] = (),
-    others_m2: Mapping[OtherError, Array] | None = None,
+    others_m2: Mapping[OtherError, Array] = MappingProxyType({}),
 ) -> tuple[Component, ...]:
     """Return the components of the errors of c bins of ranges, without those of the map.
 
     Args:
-        curve_stddev_m: (n,) of a learnt error curve that was subtracted; None if none was.
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted; NaN if none was.
         ruled_out: names of components that the user knows to be absent.
         others_m2: (c, c) covariances of further errors, by name, which are not learnt.
     """
     # With one tag, its own bias is the common bias.
     left_out = {*ruled_out, *(() if np.ptp(bins.tag_index) else ("tag_bias",))}
-    of_anchor, is_calibrated = np.outer(bins.noisiness, bins.noisiness), curve_stddev_m is not None
+    of_anchor, is_calibrated = np.outer(bins.noisiness, bins.noisiness), bool(np.isfinite(curve_stddev_m).any())
     found = [
         Component(
             each.name,
@@ -73,8 +46,8 @@ def radio_components(
         for each in COMPONENTS
         if each.name not in left_out
     ]
-    known = dict(others_m2 or {})
-    if curve_stddev_m is not None:
+    known = dict(others_m2)
+    if is_calibrated:
         stddev = bins.mean(curve_stddev_m)
         smooth = next(each for each in COMPONENTS if each.name == "curve")
         known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(bins)
@@ -103,7 +76,7 @@ def learn_errors(
     design: Array,
     prior_design: Array,
     noise_m: float,
-) -> LearnedErrors:
+) -> Noise:
     """Learn the sizes of the components of the errors of c bins, as ``learnt_sizes``.
 
     Args:
@@ -113,4 +86,4 @@ def learn_errors(
     """
     given = widened(components, noise_m)
     sizes = learnt_sizes(given, off_m, design, prior_design)
-    return LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)
+    return noise_of_sizes(given, sizes, len(bins))

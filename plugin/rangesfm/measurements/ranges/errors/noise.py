@@ -61,9 +61,13 @@ def short_range_stddev(distance_m: Array) -> Array:
     return _SHORT_RANGE_STDDEV_M * np.exp(-distance_m / SHORT_RANGE_LENGTH_M)
 
 
-def shared_stddev(distance_m: Array, curve_stddev_m: Array | None) -> Array:
-    """Return the (n,) stddev of errors that ranges of similar length share, by the error curve or for short ranges."""
-    return short_range_stddev(distance_m) if curve_stddev_m is None else curve_stddev_m
+def shared_stddev(distance_m: Array, curve_stddev_m: Array) -> Array:
+    """Return the (n,) stddev of errors that ranges of similar length share, by the error curve or for short ranges.
+
+    Args:
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted; NaN if none was.
+    """
+    return np.where(np.isnan(curve_stddev_m), short_range_stddev(distance_m), curve_stddev_m)
 
 
 def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
@@ -83,9 +87,7 @@ def stretch_labels(times_s: Array, length_s: float) -> Indices:
     return np.asarray(np.floor(since / length_s).astype(np.int64))
 
 
-def correlation_inflation(
-    scaled_residuals: Array, weights: Array, groups: Indices, shares: Array | None = None
-) -> float:
+def correlation_inflation(scaled_residuals: Array, weights: Array, groups: Indices, shares: Array) -> float:
     """Return the ratio of the standard deviation of a mean to its value for independent errors.
 
     Residuals of one anchor in one stretch of time (a group) tend to err alike. The result is the square root of the
@@ -93,10 +95,9 @@ def correlation_inflation(
 
     Args:
         scaled_residuals: (n,) in standard deviations. weights: (n,) robust. groups: (n,) int labels.
-        shares: (n,) further weights, if not all alike: a share of one half formally means twice the variance.
+        shares: (n,) further weights: a share of one half formally means twice the variance.
     """
     influence = scaled_residuals * weights
-    shares = np.ones(len(influence)) if shares is None else shares
     _, index = np.unique(groups, return_inverse=True)
     sums = np.bincount(index, shares * influence)
     squares = float(np.sum(shares * influence**2))

@@ -132,7 +132,8 @@ def _expected_curve(
 ) -> tuple[Array, Array, Array]:
     """Return the (k,) expected curve at knots, given the errors (c,) of bins, its stddev, and the (m,) biases."""
     # Errors off the anchors' axes are alike at all anchors: the curve has them, and each survey expects its own anew.
-    expected, nothing = radio_components(bins, ruled_out=("off_axis",)), np.zeros((len(bins), 1))
+    no_curve, nothing = np.full(len(bins.of_range), np.nan), np.zeros((len(bins), 1))
+    expected = radio_components(bins, no_curve, ruled_out=("off_axis",))
     learned = learn_errors(expected, bins, error_m, nothing, np.ones((1, 1)), noise_m)
     total = learned.covariance_m2
     factor = cho_factor(total + ROUNDING * np.trace(total) * np.eye(len(total)))

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import (
     MIN_NOISE_M,
     MIN_NUM_OF_SCATTER,
@@ -70,7 +69,6 @@ class RangeErrors:
         noise_m: standard deviation of an ordinary range on a map that is only scaled, turned and moved; an upper limit
             for maps that bend.
         log_likelihood: highest one of residuals of these ranges so far with the bounded loss.
-        learned: components learnt in the scale stage; None before.
     """
 
     stddev_m: Array
@@ -86,7 +84,6 @@ class RangeErrors:
     common_bias_stddev_m: float
     noise_m: float = np.inf
     log_likelihood: float = -np.inf
-    learned: LearnedErrors | None = None
 
     @classmethod
     def begin(cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions) -> RangeErrors:
@@ -138,7 +135,7 @@ class RangeErrors:
         """Return the errors of some of the ranges."""
         part: dict[str, Any] = {name: values[rows] for name, values in self._of_each_range()}
         part["place"] = np.unique(part["place"], return_inverse=True)[1]
-        return replace(self, learned=None if self.learned is None else self.learned.subset(rows), **part)
+        return replace(self, **part)
 
     def spread(self, rows: Indices, num: int) -> RangeErrors:
         """Return the errors as ``rows`` of ``num`` ranges; the others have no place, and get NaN or label 0."""
@@ -146,7 +143,7 @@ class RangeErrors:
         for name, values in self._of_each_range():
             spread[name] = np.full(num, np.nan if values.dtype == np.float64 else 0, dtype=values.dtype)
             spread[name][rows] = values
-        return replace(self, learned=None if self.learned is None else self.learned.spread(rows, num), **spread)
+        return replace(self, **spread)
 
     def _of_each_range(self) -> list[tuple[str, npt.NDArray[Any]]]:
         values = ((field.name, getattr(self, field.name)) for field in fields(self))

@@ -206,7 +206,7 @@ def _settled_test(problem: Linearized, original: Hypothesis) -> tuple[Test, floa
             hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
     factorized = Factorization(at.with_learnt_errors([hypothesis.columns]))
     [test] = factorized.estimates([hypothesis])
-    deviance = np.inf if diverges else factorized.deviance(test)
+    deviance = np.inf if diverges else factorized.deviance(test.statistic)
     return replace(test, hypothesis=original, sizes=undone + test.sizes), deviance, at.on_map.state
 
 

@@ -74,13 +74,20 @@ class Factorization(Solved):
         place = problem.place.reshape(-1, problem.columns.num)
         self._place = place.T @ place / len(problem.place)
 
-    def deviance(self, made: Test | None = None) -> float:
-        """Return -2 times the log-likelihood of observations and errors, up to a constant; with a mistake if given.
+    def deviance(self, explained: float = 0.0) -> float:
+        """Return -2 times the log-likelihood of observations and errors, up to a constant.
 
         It compares two explanations of the same bins, each with the errors that it leaves.
+
+        Args:
+            explained: the part of the sum of squares that a mistake explains, its statistic.
         """
-        squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
-        return squares + 2 * float(np.sum(np.log(np.diag(self.lower)))) + self.problem.unlikeliness
+        return (
+            float(self.residual @ self.residual)
+            - explained
+            + 2 * float(np.sum(np.log(np.diag(self.lower))))
+            + self.problem.unlikeliness
+        )
 
     def step_with(self, mistake: Array) -> Array:
         """Return the (p,) step from the state to the likeliest one, given the effect (c + r,) of a mistake."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.errors.components import CLOCKS, OtherError
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, widened
+from rangesfm.measurements.ranges.errors.learned import widened
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
@@ -23,7 +23,7 @@ from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import BENDS, MapBending
-from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
+from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Noise
 from rangesfm.solver.posterior import Observations, Posterior
 
 RANGES = "ranges"
@@ -107,21 +107,19 @@ def _of_anchors(problem: RangeProblem) -> LocatedDistances:
     return problem.distances.subset(~problem.distances.is_between_points)
 
 
-def shared_errors_m(solution: Solution, learned: LearnedErrors, of_range: Indices) -> Array:
-    """Return the errors (n, k) that ranges share, for k independent standard deviations.
+def shared_errors_m(solution: Solution, noise: Noise, bins: RangeBins) -> Array:
+    """Return the errors (n, k) that the n ranges of a solution share, for k independent standard deviations.
 
     They are the principal axes of the learnt errors, in units of what a bin's ranges scatter by themselves; axes along
     which the errors are smaller than that are noise to the bins anyway.
 
     Args:
-        solution: by the ranges. learned: their errors; those of the map are left out, as photos see them.
-        of_range: (n,) bins of the ranges; -1 for a range that took no part, which has none of the errors.
+        solution: by the ranges. noise: of their bins; the errors of the map are left out, as photos see them.
     """
-    covariance_m2 = learned.without("white", *BENDS).covariance_m2
-    errors, bins = solution.errors, learned.bins
+    covariance_m2, errors = noise.without("white", *BENDS).covariance_m2, solution.errors
     worth = bins.total(errors.worth * solution.fit.weights / errors.stddev_m**2)
     scatter_m = 1 / np.sqrt(np.maximum(worth, 1e-12))
     variances, axes = np.linalg.eigh(covariance_m2 / np.outer(scatter_m, scatter_m))
     matters = variances > 1
     of_bins = scatter_m[:, None] * axes[:, matters] * np.sqrt(variances[matters])
-    return np.where(of_range[:, None] >= 0, of_bins[of_range], 0.0)
+    return np.asarray(of_bins[bins.of_range])

@@ -67,6 +67,7 @@ class RangeEstimate:
         observations: all ranges of the log, with their status by final weight.
         errors: of all n ranges, as weighted; their inflation widens the formal standard deviation.
         noise_stddev_m: standard deviation of an ordinary range.
+        error_stddevs: learnt standard deviations of the components of the errors, by name; empty before.
         median_off_m: median of the absolute differences of ranges and map; NaN if no range took part.
         anchors: estimates in the order of the log.
         per_anchor: scale from each anchor alone, by id; anchors that do not determine one are missing.
@@ -79,6 +80,7 @@ class RangeEstimate:
     observations: RangeObservations
     errors: RangeErrors
     noise_stddev_m: float = np.nan
+    error_stddevs: Mapping[str, float] = field(default_factory=dict)
     median_off_m: float = np.nan
     anchors: tuple[AnchorEstimate, ...] = ()
     per_anchor: Mapping[str, float] = field(default_factory=dict)

@@ -14,7 +14,7 @@ from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_k
 from rangesfm.measurements.kind import Block, Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.components import CLOCKS
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins
 from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m, bent_to_ranges, drifts, likelier_sides
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import linearized
@@ -130,29 +130,31 @@ class RangeScale(KindOnMap):
     def concluded(self, on_map: JointMap) -> RangeScale:
         """Return the ranges with what the whole map says of them."""
         posed, solution, told = self.posed, self.solution, self.told
-        log, learned = posed.observations.log, self.learnt(on_map)
+        log, bins, noise = posed.observations.log, bins_on(on_map), on_map.problem.noise_of(RANGES)
         if on_map.is_at_rest:
-            errors = replace(told.errors, learned=learned.spread(posed.rows, len(log)))
-            return replace(self, told=replace(told, errors=errors, noise_stddev_m=solution.noise_stddev_m))
+            stddevs = noise.stddev_of_component
+            return replace(self, told=replace(told, noise_stddev_m=solution.noise_stddev_m, error_stddevs=stddevs))
         known, after = on_map.posterior, self.moved(on_map.posterior)
-        errors = replace(solution.errors, learned=learned).spread(posed.rows, len(log))
         status = posed.observations.status.copy()
         status[posed.observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
         status[posed.rows] = status_by_weight(solution.fit.weights)
         found = RangeEstimate(
             replace(posed.observations, status=status),
-            errors,
+            solution.errors.spread(posed.rows, len(log)),
             solution.noise_stddev_m,
+            noise.stddev_of_component,
             float(np.median(np.abs(solution.fit.residuals_m))),
             anchor_estimates(after.solution, log.anchor_ids, known.covariance),
             scale_per_anchor(solution, log.anchor_ids),
-            scale_sensitivity(after.solution, posed, on_map.problem.of_kind(RANGES, known.gains), learned.bins),
+            scale_sensitivity(after.solution, posed, on_map.problem.of_kind(RANGES, known.gains), bins),
             _paper_table(solution),
             np.zeros((len(log), 0)),
         )
         if any(each.is_used for each in on_map.kinds if each.kind != self.kind):
-            of_range = learned.spread(posed.rows, len(log)).of_range
-            found = replace(found, shared_errors_m=shared_errors_m(solution, learned, of_range))
+            of_rows = shared_errors_m(solution, noise, bins)
+            shared_m = np.zeros((len(log), of_rows.shape[1]))
+            shared_m[posed.rows] = of_rows
+            found = replace(found, shared_errors_m=shared_m)
         return replace(self, told=found, notes=(*self.notes, *self._levelled(found.anchors)))
 
     def _levelled(self, found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
@@ -166,12 +168,6 @@ class RangeScale(KindOnMap):
         """Return what is said of the ranges."""
         del before
         return self.told
-
-    def learnt(self, on_map: JointMap) -> LearnedErrors:
-        """Return the errors of the ranges as learnt on a map, with those of the map."""
-        observed = on_map.observed[RANGES]
-        assert isinstance(observed, BinnedRanges), "ranges come in bins"
-        return LearnedErrors.from_noise(on_map.problem.noise_of(RANGES), observed.bins)
 
     def on(self, on_map: JointMap) -> RangesOnMap:
         """Return the ranges for tests: where they are on a map at rest, or where they bend one that is only scaled."""
@@ -243,6 +239,13 @@ class RangeScale(KindOnMap):
             others = [unknown if each is self else each for each in on_map.kinds]
             unplaced = on_map.rejoined(others, unknown.start).posterior.uncertainty
             yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
+
+
+def bins_on(on_map: JointMap) -> RangeBins:
+    """Return the bins in which the ranges are observations of a map."""
+    observed = on_map.observed[RANGES]
+    assert isinstance(observed, BinnedRanges), "ranges come in bins"
+    return observed.bins
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

@@ -133,10 +133,9 @@ class ScaleProblem:
         return np.asarray(velocities @ self.trajectory.world_from_cam[0])
 
     @property
-    def curve_stddev_m(self) -> Array | None:
-        """(k,) standard deviations of a learnt error curve that was subtracted from the ranges; None if none was."""
-        of_log = self.observations.log.shared_stddev_m
-        return None if of_log is None else of_log[self.rows]
+    def curve_stddev_m(self) -> Array:
+        """(k,) standard deviations of a learnt error curve that was subtracted from the ranges; NaN if none was."""
+        return self.observations.log.shared_stddev_m[self.rows]
 
     @property
     def _nearest(self) -> Indices:
