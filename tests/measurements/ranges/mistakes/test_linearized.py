@@ -130,3 +130,14 @@ class TestDerivatives:
             return problem.bins.mean(state.metric_from_model.apply(on_map.problem.centers))
 
         np.testing.assert_allclose(problem.place, slopes(places_m, problem.columns.num), atol=1e-7)
+
+    @pytest.mark.parametrize("num_tags", [1, 2])
+    def test_a_lever_arm_moves_the_tags_with_the_camera(self, num_tags: int) -> None:
+        on_map = small_map(num_tags=num_tags)
+        problem = linearized(on_map)
+
+        def residual_m(arm_m: Array) -> Array:
+            tags = on_map.problem.tag_from_center + on_map.model_from_cam @ arm_m
+            return problem.bins.mean(replace(on_map, problem=replace(on_map.problem, tag_from_center=tags)).residual_m)
+
+        np.testing.assert_allclose(problem.by_lever_arm, slopes(residual_m, 3), atol=1e-7)
