@@ -12,7 +12,6 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.measurements.clock.fit import Observed, OffsetFit
@@ -69,8 +68,7 @@ class TimedRanges(Observed):
         points = points - points.mean(axis=0)
         unit = max(float(np.sqrt(np.mean(points**2))), 1e-300)
         points = points / unit
-        num, group = len(points), np.unique(here.anchor, return_inverse=True)[1]
-        by_anchor = csr_array((np.ones(num), (group, np.arange(num))))
+        num, of_anchors = len(points), rows_by_key(here.anchor)
         design, squared_m2 = np.column_stack([points, np.ones(num)]), here.range_m**2
         squared_norm = np.sum(points**2, axis=1)
         # Division by the derivative of rho^2 converts residuals back to metres.
@@ -80,29 +78,28 @@ class TimedRanges(Observed):
             weights = self.loss.weights(residuals_m / here.residual_stddev(residuals_m))
             of_row = metres * np.sqrt(weights)
             # The anchors' own unknowns are eliminated: what they explain of other columns is subtracted.
-            basis, by_basis = _orthonormal(of_row[:, None] * design, by_anchor, group)
+            basis, by_basis = _orthonormal(of_row[:, None] * design, of_anchors)
             curvature, left_over = (
-                column - np.sum(basis * (by_anchor @ (basis * column[:, None]))[group], axis=1)
-                for column in (of_row * squared_norm, of_row * squared_m2)
+                column - basis @ (basis.T @ column) for column in (of_row * squared_norm, of_row * squared_m2)
             )
             length = float(np.linalg.norm(curvature))
             alpha_squared = max(float(curvature @ left_over) / max(length**2, 1e-300), 0.0)
             residuals = left_over - alpha_squared * curvature
             residuals_m = residuals / np.sqrt(weights)
-        of_anchors = by_anchor @ (basis * (of_row * (squared_m2 - alpha_squared * squared_norm))[:, None])
-        slopes = np.einsum("gij,gj->gi", by_basis, of_anchors)[group, :3]
+        by_column = basis.T @ (of_row * (squared_m2 - alpha_squared * squared_norm))
+        slopes = np.empty((num, 3))
+        for rows, unknowns in zip(of_anchors, np.einsum("kij,kj->ki", by_basis, by_column.reshape(-1, 4)), strict=True):
+            slopes[rows] = unknowns[:3]
         rates = metres * np.sum((2 * alpha_squared * points + slopes) * velocities, axis=1) / unit
         is_curved = alpha_squared * length > _MIN_CURVATURE_STDDEVS * np.std(residuals)
-        of_all = np.zeros((num, len(by_basis), 4))
-        of_all[np.arange(num), group] = basis
-        is_kept = by_basis.any(axis=1).ravel()
+        basis = basis[:, by_basis.any(axis=1).ravel()]
         return OffsetFit(
             offset_s,
             here,
             weights,
             residuals_m,
             rates,
-            np.column_stack([of_all.reshape(num, -1)[:, is_kept], curvature / max(length, 1e-300)]),
+            np.column_stack([basis, curvature / max(length, 1e-300)]),
             4 * len(by_basis) + 1,
             float(np.sqrt(alpha_squared)) / unit if is_curved else np.inf,
         )
@@ -124,21 +121,21 @@ class TimedRanges(Observed):
         return OffsetCurve(cells.offsets_s, num, variation, residual)
 
 
-def _orthonormal(columns: Array, by_anchor: csr_array, group: Indices) -> tuple[Array, Array]:
-    """Make the (n, 4) columns of the anchors' own unknowns orthonormal, over the ranges of each anchor.
-
-    Args:
-        by_anchor: (k, n) 1 where a range is to an anchor. group: (n,) index of the anchor.
+def _orthonormal(columns: Array, of_anchors: list[Indices]) -> tuple[Array, Array]:
+    """Make the (n, 4) columns of the anchors' own unknowns orthonormal, over the ranges of each of k anchors.
 
     Returns:
-        (n, 4) columns, and (k, 4, 4) the anchors' unknowns by these.
+        (n, 4 k) columns, 0 for the ranges of other anchors, and (k, 4, 4) the anchors' unknowns by these.
     """
-    products = (columns[:, :, None] * columns[:, None, :]).reshape(-1, 16)
-    squared_lengths, directions = np.linalg.eigh((by_anchor @ products).reshape(-1, 4, 4))
+    own = [columns[rows] for rows in of_anchors]
+    squared_lengths, directions = np.linalg.eigh([each.T @ each for each in own])
     # On a flat or straight path some columns contain only rounding errors, and are dropped.
     kept = squared_lengths > 1e-10 * squared_lengths[:, -1:]
     by_basis = directions * np.where(kept, 1 / np.sqrt(np.where(kept, squared_lengths, 1.0)), 0.0)[:, None]
-    return np.einsum("ni,nij->nj", columns, by_basis[group]), by_basis
+    basis = np.zeros((len(columns), len(own), 4))
+    for k, rows in enumerate(of_anchors):
+        basis[rows, k] = own[k] @ by_basis[k]
+    return basis.reshape(len(columns), -1), by_basis
 
 
 def _sums_of_anchor(
