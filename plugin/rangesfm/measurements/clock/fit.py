@@ -9,14 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.measurements.clock.offset import OffsetCurve, TimeOffset
-from rangesfm.measurements.clock.path_samples import MIN_COVERAGE, scan_parts
+from rangesfm.measurements.clock.path_samples import MIN_COVERAGE, PathSamples, scan_parts
 from rangesfm.measurements.ranges.errors.noise import MIN_NOISE_M, STRETCH_S
 from rangesfm.util.geometry.numerics import (
     MAX_NUM_ROUNDS,
@@ -36,6 +36,8 @@ SEPARATION_S = 0.5
 """Offsets that are nearer to each other are one, and no step of a descent is longer."""
 # A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
 _FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
+# Standard deviation of the error that all ranges share because of the tag's delay.
+_COMMON_STDDEV_M = 0.05
 # Smallest number of blocks of time whose errors count as independent.
 _MIN_NUM_BLOCKS = 12
 # The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
@@ -46,15 +48,16 @@ _MIN_GAIN_STDDEVS = 7.0
 
 @dataclass(frozen=True)
 class Observed(ABC):
-    """What was observed at m times, such as ranges, and the path along which it was, in any form.
+    """What was observed at m times along a path, such as ranges.
 
-    Each time has as many numbers as a kind has coordinates, n in all, in one unit.
+    Each time has as many numbers as a kind has coordinates, n in all, in metres.
 
     Attributes:
-        times_s: (m,) times on the clock of the observing system.
+        times_s: (m,) times on the clock of the observing system. path: of the camera.
     """
 
     times_s: Array
+    path: PathSamples
 
     name: ClassVar[str]
     """What they are, in words."""
@@ -62,10 +65,6 @@ class Observed(ABC):
     """What the user can do where the motion does not determine the offset."""
     may_drift: ClassVar[bool] = False
     """Whether a drift of the clocks is looked for."""
-    least_stddev: ClassVar[float] = MIN_NOISE_M
-    """Smallest standard deviation of a number."""
-    common_stddev: ClassVar[float] = 0.05
-    """Standard deviation of an error that all numbers share, as that of ranges by the tag's delay, metres."""
 
     @property
     @abstractmethod
@@ -82,15 +81,6 @@ class Observed(ABC):
         """(m,) weights with which all offsets are compared at first."""
         return np.ones(len(self.times_s))
 
-    @property
-    @abstractmethod
-    def path_span_s(self) -> float:
-        """Time from the start of the path to its end."""
-
-    @abstractmethod
-    def on_path(self, offset_s: float) -> Mask:
-        """Return which of them (m,) are on the path at an offset."""
-
     @abstractmethod
     def scanned(self, weights: Array) -> OffsetCurve:
         """Return the best fit at every offset, with (m,) weights and without the lever arm."""
@@ -103,10 +93,18 @@ class Observed(ABC):
             before: fit at this offset or near it, whose scale the lever arm has; None: the lever arm is left out.
         """
 
+    def on_path(self, offset_s: float) -> Mask:
+        """Return which of them (m,) are on the path at an offset."""
+        return self.path.knows(self.times_s + offset_s)
+
     def take(self, rows: Indices | Mask) -> Self:
         """Return some of the observations."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return replace(self, **{name: array[rows] for name, array in values.items() if isinstance(array, np.ndarray)})
+        columns: dict[str, Any] = {
+            each.name: values[rows]
+            for each in fields(self)
+            if isinstance(values := getattr(self, each.name), np.ndarray)
+        }
+        return replace(self, **columns)
 
     def first_on_path(self, offset_s: float, max_num: int) -> Self:
         """Return the first observations that are on the path at an offset, at most ``max_num``."""
@@ -120,7 +118,7 @@ class Observed(ABC):
         Args:
             weights: (m,).
         """
-        return scan_parts(self.times_s, self.path_span_s, lambda rows: self.take(rows).scanned(weights[rows]))
+        return scan_parts(self.times_s, self.path.span_s, lambda rows: self.take(rows).scanned(weights[rows]))
 
     @property
     def deviations(self) -> Array:
@@ -130,9 +128,10 @@ class Observed(ABC):
             deviations[rows] -= np.median(deviations[rows])
         return deviations
 
-    def residual_stddev(self, residuals: Array) -> float:
-        """Return a robust standard deviation of residuals, at least the smallest one."""
-        return max(robust_stddev(residuals), self.least_stddev)
+
+def residual_stddev(residuals: Array) -> float:
+    """Return a robust standard deviation of residuals, at least the smallest noise."""
+    return max(robust_stddev(residuals), MIN_NOISE_M)
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ class OffsetFit:
 
     @property
     def residual_stddev(self) -> float:
-        return self.observed.residual_stddev(self.residuals)
+        return residual_stddev(self.residuals)
 
     @property
     def is_testable(self) -> bool:
@@ -219,7 +218,7 @@ class OffsetFit:
         """Gain in each number's log-likelihood over a camera that stands still (n,)."""
         deviations = self.observed.deviations
         own = self.losses(self.residual_stddev)
-        return _losses(deviations, self.observed.residual_stddev(deviations)) - own
+        return _losses(deviations, residual_stddev(deviations)) - own
 
     @property
     def score(self) -> float:
@@ -269,7 +268,7 @@ class OffsetFit:
         usual = max(_MIN_NUM_BLOCKS, float(np.ptp(times)) / (2 * STRETCH_S))
         blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
         by_chance = _jackknife_variances(own, residuals, self, blocks)
-        by_bias = np.linalg.lstsq(own, self.observed.common_stddev * np.sqrt(self.weights), rcond=None)[0]
+        by_bias = np.linalg.lstsq(own, _COMMON_STDDEV_M * np.sqrt(self.weights), rcond=None)[0]
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 

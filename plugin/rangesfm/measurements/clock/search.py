@@ -97,11 +97,11 @@ def _likely_fits(fits: Sequence[OffsetFit], observed: Observed) -> list[tuple[Of
     if not order:
         raise GeometryError(
             f"too few {name} along the camera's path to find the time offset (the log lasts {log_s:.4g} s, the photos "
-            f"{observed.path_span_s:.4g} s): {remedy}"
+            f"{observed.path.span_s:.4g} s): {remedy}"
         )
     best, most = fits[order[0]], num_on_path[order[0]]
     same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timed().stddev_s, 1.0))
-    shorter_s, longer_s = sorted([log_s, observed.path_span_s])
+    shorter_s, longer_s = sorted([log_s, observed.path.span_s])
     difference = max(1.0 - shorter_s / longer_s, _LEAST_DIFFERENCE)
     # Two durations of which nothing is known differ by less than a small share with twice that probability.
     prior_of_the_others = _PRIOR_OF_THE_OTHERS * min(2.0 * difference, 1.0)

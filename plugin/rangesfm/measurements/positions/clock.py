@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.measurements.clock.fit import Observed, OffsetFit, orthonormal
+from rangesfm.measurements.clock.fit import Observed, OffsetFit, orthonormal, residual_stddev
 from rangesfm.measurements.clock.offset import OffsetCurve
-from rangesfm.measurements.clock.path_samples import Cells, PathSamples, centred_columns, moving_path
+from rangesfm.measurements.clock.path_samples import Cells, centred_columns, moving_path
 from rangesfm.measurements.clock.search import offset_of_motion, require_enough
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.util.files.photo_names import rows_of_photos, told_none
@@ -31,7 +31,6 @@ _MUCH_WORSE = 3.0
 class TimedPositions(Observed):
     """n positions (n, 3) in metres along a path."""
 
-    path: PathSamples
     position_m: Array
 
     name = "positions"
@@ -49,13 +48,6 @@ class TimedPositions(Observed):
     def start_weights(self) -> Array:
         return _weights_by_place(self.position_m)
 
-    @property
-    def path_span_s(self) -> float:
-        return self.path.span_s
-
-    def on_path(self, offset_s: float) -> Mask:
-        return self.path.knows(self.times_s + offset_s)
-
     def fit(self, offset_s: float, before: OffsetFit | None = None) -> OffsetFit:
         """Fit a similarity from the path to the positions by reweighted least squares."""
         here = self.take(self.on_path(offset_s))
@@ -66,7 +58,7 @@ class TimedPositions(Observed):
             found = align_points(points, here.position_m, weights=weights)
             predicted_m = found.apply(points)
             residuals_m = here.position_m - predicted_m
-            away = np.sqrt(np.mean(residuals_m**2, axis=1)) / here.residual_stddev(residuals_m.ravel())
+            away = np.sqrt(np.mean(residuals_m**2, axis=1)) / residual_stddev(residuals_m.ravel())
             weights = CAUCHY.weights(away)
         of_coordinates = np.repeat(weights, 3)
         motions = similarity_motions(predicted_m - predicted_m.mean(axis=0)).reshape(-1, 7)

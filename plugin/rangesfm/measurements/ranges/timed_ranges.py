@@ -13,10 +13,10 @@ from itertools import combinations_with_replacement
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices, Mask, rows_by_key
-from rangesfm.measurements.clock.fit import Observed, OffsetFit
+from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.measurements.clock.fit import Observed, OffsetFit, residual_stddev
 from rangesfm.measurements.clock.offset import OffsetCurve
-from rangesfm.measurements.clock.path_samples import Cells, PathSamples, centred_columns
+from rangesfm.measurements.clock.path_samples import Cells, centred_columns
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import CAUCHY, RobustLoss
@@ -32,7 +32,6 @@ _MIN_CURVATURE_STDDEVS = 5.0
 class TimedRanges(Observed):
     """n ranges in metres along a path, with the indices of their anchors and tags, and the loss of the fit."""
 
-    path: PathSamples
     range_m: Array
     anchor: Indices
     tag: Indices
@@ -49,13 +48,6 @@ class TimedRanges(Observed):
     @property
     def alike(self) -> Indices:
         return self.anchor
-
-    @property
-    def path_span_s(self) -> float:
-        return self.path.span_s
-
-    def on_path(self, offset_s: float) -> Mask:
-        return self.path.knows(self.times_s + offset_s)
 
     def fit(self, offset_s: float, before: OffsetFit | None = None) -> OffsetFit:
         """Fit ``rho^2 = alpha^2 |p|^2 + b.p + k``, with b and k for each anchor and one scale alpha for all.
@@ -75,7 +67,7 @@ class TimedRanges(Observed):
         metres = 1 / (2 * np.maximum(here.range_m, _MIN_RANGE_M))
         residuals_m = np.zeros(num)
         for _ in range(NUM_REWEIGHTINGS + 1):
-            weights = self.loss.weights(residuals_m / here.residual_stddev(residuals_m))
+            weights = self.loss.weights(residuals_m / residual_stddev(residuals_m))
             of_row = metres * np.sqrt(weights)
             # The anchors' own unknowns are eliminated: what they explain of other columns is subtracted.
             basis, by_basis = _orthonormal(of_row[:, None] * design, of_anchors)
