@@ -57,9 +57,7 @@ def binned_ranges(
     own = replace(on_map.problem, distances=_of_anchors(on_map.problem), placement=None)
     on_map = replace(on_map, problem=own)
     noise_of_anchor = noisiness(own.anchor_index, fit.residuals_m, own.num_anchors)
-    # A range of which the log states the noise counts by that.
-    precision = np.where(solution.errors.is_estimated, solution.noise_stddev_m, solution.errors.given_m) ** -2.0
-    bins = on_map.bins(fit.weights * (precision / np.median(precision)), noise_of_anchor, max_num_bins)
+    bins = on_map.bins(fit.weights, noise_of_anchor, max_num_bins)
     if on_map.velocity is not None and (clock_s := posed.observations.time_offset_stddev_s):
         rates = bins.mean(on_map.by_time)
         others_m2[CLOCKS] = clock_s**2 * np.outer(rates, rates)
