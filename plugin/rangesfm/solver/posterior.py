@@ -19,7 +19,7 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
 from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, regular
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
-from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -232,8 +232,6 @@ class JointProblem:
         if self.bending.given_sizes is not None:
             return self
         used, linear, widened = self.is_used, self.linear, self.linear.with_more(mistakes)
-        # Residuals are taken where those of the priors are smallest.
-        back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=UNDETERMINED)[0]
         # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
         num_kinds = sum(used[rows].any() for rows in self.rows.values())
         most_bent = min(most_bent, SIGNIFICANT_STDDEVS) if num_kinds > 1 else most_bent
@@ -246,7 +244,7 @@ class JointProblem:
             )
         sizes = learnt_sizes(
             components,
-            (linear.design @ back - linear.residual_m)[used],
+            -linear.residual_m[used],
             widened.design[used],
             widened.prior_design,
             {name: most_bent if name in BENDS else most_unusual for name in self.sizes},

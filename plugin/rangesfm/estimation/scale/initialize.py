@@ -139,7 +139,8 @@ def _started(
         is_all = len(used) == 1 and (used[0].places_map or used[0].is_solved)
         by_kind = {} if is_all else {each.kind: each.alone.scale for each in used}
         if len(used) == 1:
-            return replace(used[0].alone, kinds=kinds), by_kind
+            alone = used[0].alone
+            return (alone.rejoined(kinds, alone.placed) if len(kinds) > 1 else replace(alone, kinds=kinds)), by_kind
         kinds = tuple(each.with_their_share() for each in kinds)
         placed = place_first([each for each in kinds if each.is_used]).start
         if len(others) == len(kinds):

@@ -62,11 +62,12 @@ def widening(noise_m: float) -> float:
 def widened(components: Sequence[Component], noise_m: float) -> tuple[Component, ...]:
     """Return the components of the errors of ranges with this noise, of which a noisier radio than usual has more."""
     larger = widening(noise_m) ** 2
-    # Bending does not depend on the radio, and the noise is measured itself.
-    return tuple(
-        replace(each, alike=larger * each.alike) if each.spread > 0 and each.name not in (*BENDS, "white") else each
-        for each in components
-    )
+    return tuple(replace(each, alike=larger * each.alike) if is_widened(each) else each for each in components)
+
+
+def is_widened(component: Component) -> bool:
+    """Return whether a noisier radio has more of it: neither of bending, nor of the noise itself, which is measured."""
+    return component.spread > 0 and component.name not in (*BENDS, "white")
 
 
 def learn_errors(

@@ -11,15 +11,15 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.ranges.errors.components import DRIFT_S, WANDERING
+from rangesfm.measurements.ranges.errors.learned import is_widened, widening
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.noise import usual_sizes
 from rangesfm.solver.posterior import JointProblem, joined
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
 from rangesfm.util.geometry.similarity import similarity_motions
 
@@ -99,13 +99,21 @@ class Linearized(JointProblem):
         """Return the problem with the errors learnt while mistakes explain what they can; arguments as of ``learnt``.
 
         A radio that errs by significantly more than others was mistaken, which must not pass for noise. A map may bend
-        by any amount.
+        by any amount. Residuals are taken where those of the priors are smallest, with the map as it is.
         """
-        return self.learnt(*mistakes, most_unusual=SIGNIFICANT_STDDEVS, near=near)
+        linear = self.linear
+        back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=ROUNDING)[0]
+        there = replace(self, linear=replace(linear, residual_m=linear.residual_m - linear.design @ back))
+        return replace(self, sizes=there.learnt(*mistakes, most_unusual=SIGNIFICANT_STDDEVS, near=near).sizes)
 
     def with_usual_errors(self) -> Linearized:
-        """Return the problem with the errors usual for radios and maps with this scatter."""
-        return replace(self, sizes=usual_sizes(self.components) | {"white": self.scatter_m})
+        """Return the problem with this scatter, and all other errors as usual for radios and maps.
+
+        Only where errors are learnt does a noisier radio have more of all kinds.
+        """
+        larger = widening(self.scatter_m)
+        sizes = {each.name: each.usual / (larger if is_widened(each) else 1.0) for each in self.components}
+        return replace(self, sizes=sizes | {"white": self.scatter_m})
 
     def at_state(self, on_map: RangesOnMap) -> Linearized:
         """Linearise at another state or for corrected ranges, with the same bins and errors."""
