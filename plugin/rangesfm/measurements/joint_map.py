@@ -339,19 +339,22 @@ def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:
     return next((each for each in kinds if isinstance(each, kind)), None)
 
 
+def compared(kinds: Sequence[KindOnMap]) -> list[KindOnMap]:
+    """Return the kinds that are used, and, beside others that place the map in the site, positions there anyway."""
+    in_site = any(each.places_map for each in kinds if each.is_used)
+    return [each for each in kinds if each.is_used or (in_site and each.places_map)]
+
+
 def observations(
     kinds: Sequence[KindOnMap], placed: Similarity, max_num: int = MAX_NUM_OBSERVATIONS
 ) -> list[Observations]:
-    """Return the observations of the kinds that are used, about a placement, of which none crowds out another.
-
-    Beside others that place the map in the site, positions there are among them even if all are only compared with it.
+    """Return the observations of the kinds that are compared, about a placement, of which none crowds out another.
 
     Args:
         max_num: about the largest number of all together.
     """
     in_site, found, num = any(each.places_map for each in kinds if each.is_used), list[Observations](), 0
-    seen = [each for each in kinds if each.is_used or (in_site and each.places_map)]
-    for k, each in reversed(list(enumerate(seen))):
+    for k, each in reversed(list(enumerate(compared(kinds)))):
         most = max(max_num - num, max_num // 2) if k == 0 else max_num // 2
         found.append(each.observed(placed, in_site=in_site, max_num=most))
         num += len(found[-1].residual_m)

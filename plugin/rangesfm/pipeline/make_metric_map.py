@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,10 +56,10 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         return judge_map(run, metric, of_pieces)
 
 
-def _not_held(pieces: Sequence[LoosePiece], bending: MapBending) -> tuple[LoosePiece, ...]:
+def _not_held(pieces: tuple[LoosePiece, ...], bending: MapBending) -> tuple[LoosePiece, ...]:
     """Return the parts of a model that share few points with the rest, if its photos do not determine their scale."""
     if not isinstance(bending, PhotoBending):  # the photos determine nothing, or are too many to tell
-        return tuple(pieces)
+        return pieces
     return tuple(piece for piece in pieces if not bending.hold_together(piece.image_names))
 
 

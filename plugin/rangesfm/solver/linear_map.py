@@ -74,18 +74,26 @@ class LinearMap:
     prior_design: Array
     columns: Columns
 
+    @property
+    def residual(self) -> Array:
+        """(c + r,) residuals of observations, and below them of priors."""
+        return np.append(self.residual_m, self.prior_residual)
+
+    @property
+    def jacobian(self) -> Array:
+        """(c + r, p) derivatives of all residuals."""
+        return np.vstack([self.design, self.prior_design])
+
     def with_more(self, unknowns: Sequence[Array]) -> LinearMap:
         """Return the equations with further unknowns, by effects (c, m) on observations, or (c + r, m) on all."""
-        num = len(self.residual_m)
-        num_rows = num + len(self.prior_residual)
-        effects = (np.pad(each, ((0, num_rows - len(each)), (0, 0))) for each in unknowns)
-        columns = np.hstack([np.vstack([self.design, self.prior_design]), *effects])
+        num, own = len(self.residual_m), self.jacobian
+        effects = (np.pad(each, ((0, len(own) - len(each)), (0, 0))) for each in unknowns)
+        columns = np.hstack([own, *effects])
         return replace(self, design=columns[:num], prior_design=columns[num:])
 
     def solved(self, covariance_m2: Array) -> Solved:
         """Return the solution for residuals with this (c, c) covariance."""
-        residual = np.append(self.residual_m, self.prior_residual)
-        return Solved(covariance_m2, np.vstack([self.design, self.prior_design]), residual)
+        return Solved(covariance_m2, self.jacobian, self.residual)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from rangesfm.measurements.joint_map import (
     KindOnMap,
     Located,
     beside_others,
+    compared,
     fit_kinds,
     place_first,
     tested_kinds,
@@ -140,7 +141,9 @@ def _started(
         by_kind = {} if is_all else {each.kind: each.alone.scale for each in used}
         if len(used) == 1:
             alone = used[0].alone
-            return (alone.rejoined(kinds, alone.placed) if len(kinds) > 1 else replace(alone, kinds=kinds)), by_kind
+            if len(compared(kinds)) > 1:
+                return alone.rejoined(kinds, alone.placed), by_kind
+            return replace(alone, kinds=kinds), by_kind
         kinds = tuple(each.with_their_share() for each in kinds)
         placed = place_first([each for each in kinds if each.is_used]).start
         if len(others) == len(kinds):

@@ -74,18 +74,21 @@ class AnchorAlignment:
         squared = np.einsum("spi,sij,spj->sp", self._apart_m, self._information, self._apart_m)
         return np.where(np.isnan(squared), np.inf, squared)
 
+    @cached_property
+    def _pairs(self) -> Indices:
+        """(s,) which of the four pairs of sides fits best."""
+        return np.asarray(self._squared.argmin(axis=1))
+
     @property
     def sides(self) -> tuple[Indices, Indices]:
         """(s,) and (s,) which of the places in the target and in the source fit better, 0 or 1."""
-        target, source = np.divmod(self._squared.argmin(axis=1), 2)
-        return target, source
+        return self._pairs // 2, self._pairs % 2
 
     @property
     def elsewhere_m(self) -> dict[str, float]:
         """By id of each anchor that does not fit, how far it is from where it should be."""
-        far, best = self._squared.min(axis=1) > _ELSEWHERE_STDDEVS**2, self._squared.argmin(axis=1)
-        lengths = np.linalg.norm(self._apart_m, axis=2)
-        return {self.ids[row]: float(lengths[row, best[row]]) for row in np.flatnonzero(far)}
+        far, lengths = self._squared.min(axis=1) > _ELSEWHERE_STDDEVS**2, np.linalg.norm(self._apart_m, axis=2)
+        return {self.ids[row]: float(lengths[row, self._pairs[row]]) for row in np.flatnonzero(far)}
 
     @property
     def cost(self) -> float:
@@ -95,10 +98,9 @@ class AnchorAlignment:
         """Return the best motion near this one, by reweighted Gauss-Newton steps, anchors where they fit better."""
         found = self
         for _ in range(MAX_NUM_ROUNDS):
-            best = found._squared.argmin(axis=1)
-            rows, motion = np.arange(len(best)), found.target_from_source
+            best, rows, motion = found._pairs, np.arange(len(found.ids)), found.target_from_source
             weighted = CAUCHY.rho(found._squared[rows, best])[1][:, None, None] * found._information
-            moved_m = motion.apply(found.source_m[rows, best % 2])
+            moved_m = motion.apply(found.source_m[rows, found.sides[1]])
             middle = moved_m.mean(axis=0)
             by_step = similarity_motions(moved_m - middle)[:, :, 1:]
             normal = np.einsum("sia,sij,sjb->ab", by_step, weighted, by_step) + ROUNDING * np.eye(6)

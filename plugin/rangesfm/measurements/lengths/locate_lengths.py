@@ -68,6 +68,11 @@ class LocatedDistances:
         """Lengths between points of the model, not anchors, (k,)."""
         return np.asarray(self.anchor_pair[:, 0] < 0)
 
+    @property
+    def of_anchors(self) -> LocatedDistances:
+        """Those between anchors."""
+        return self.subset(~self.is_between_points)
+
     def __len__(self) -> int:
         return len(self.distance_m)
 

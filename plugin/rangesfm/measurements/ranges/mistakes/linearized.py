@@ -134,8 +134,7 @@ class Linearized(JointProblem):
         solved = self.linear.solved(self.noise.covariance_m2)
 
         def cost(of: Linearized) -> float:
-            residual = np.append(of.linear.residual_m, of.linear.prior_residual)
-            return float(np.sum(solved.whitened(residual[:, None]) ** 2))
+            return float(np.sum(solved.whitened(of.linear.residual[:, None]) ** 2))
 
         step, before = solved.step, cost(self)
         for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):

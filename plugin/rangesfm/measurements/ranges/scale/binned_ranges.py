@@ -8,12 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.errors.components import CLOCKS, OtherError
 from rangesfm.measurements.ranges.errors.learned import widened
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.scale.range_equation import (
-    RangeProblem,
     fit_at,
     prior_jacobian,
     prior_residuals,
@@ -45,16 +43,13 @@ def binned_ranges(
 ) -> BinnedRanges:
     """Average the ranges of a problem, and linearise them about its solution.
 
-    Lengths between points and known positions in the problem, which help to solve it, are observations of their own
-    here.
-
     Args:
         bending: of the map.
         max_num_bins: fewer bins are coarser and take less time.
     """
     on_map, fit = ranges_on_map(posed, solution, bending), solution.fit
     others_m2 = dict[OtherError, Array]()
-    own = replace(on_map.problem, distances=_of_anchors(on_map.problem), placement=None)
+    own = on_map.problem.without_others()
     on_map = replace(on_map, problem=own)
     noise_of_anchor = noisiness(own.anchor_index, fit.residuals_m, own.num_anchors)
     bins = on_map.bins(fit.weights, noise_of_anchor, max_num_bins)
@@ -92,7 +87,7 @@ def moved(solution: Solution, known: Posterior) -> Solution:
     anchors make one more step to where the priors are as the estimate has them.
     """
     problem, before, columns = solution.problem, solution.fit.state, known.columns
-    own = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors), distances=_of_anchors(problem), placement=None)
+    own = replace(problem.without_others(), bias_stddev_m=np.zeros(problem.num_anchors))
     slopes = prior_jacobian(own, columns, before, before)
     state = state_after((columns,), before, known.step)
     linear = prior_residuals(own, columns, before) + slopes @ known.step
@@ -100,11 +95,6 @@ def moved(solution: Solution, known: Posterior) -> Solution:
     again[columns.of_map] = 0.0
     state = state_after((columns,), before, known.step + again)
     return replace(solution, fit=fit_at(problem, state, solution.fit.weights))
-
-
-def _of_anchors(problem: RangeProblem) -> LocatedDistances:
-    """Return the distances between anchors; the others are observations of their own beside the ranges."""
-    return problem.distances.subset(~problem.distances.is_between_points)
 
 
 def shared_errors_m(solution: Solution, noise: Noise, bins: RangeBins) -> Array:

@@ -129,6 +129,13 @@ class RangeProblem:
         num, taken = (np.bincount(each.anchor_index, minlength=self.num_anchors) for each in (self, part))
         return replace(part, share=part.share * (num / np.maximum(taken, 1))[part.anchor_index])
 
+    def without_others(self) -> RangeProblem:
+        """Return the problem without lengths in the map and known positions.
+
+        They help to solve it, and are observations of their own beside the ranges.
+        """
+        return replace(self, distances=self.distances.of_anchors, placement=None)
+
     def of_anchor(self, k: int) -> RangeProblem:
         """Return the problem of the ranges to anchor k alone, with a fixed frame."""
         part, one = self.subset(np.flatnonzero(self.anchor_index == k)), slice(k, k + 1)

@@ -262,7 +262,5 @@ def _solved(solution: Solution, problem: RangeProblem) -> Solution:
 
 
 def _ranges_alone(problem: RangeProblem) -> RangeProblem:
-    distances = problem.distances.subset(~problem.distances.is_between_points)
-    if problem.placement is None:
-        return replace(problem, distances=distances)
-    return replace(problem, distances=distances, placement=None, frame_is_free=problem.has_known_anchors)
+    is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
+    return replace(problem.without_others(), frame_is_free=is_free)

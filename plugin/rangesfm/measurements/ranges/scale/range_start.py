@@ -139,7 +139,7 @@ def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit:
     Args:
         unit: of the model to which the distances refer, in units of that of the other kinds.
     """
-    found = distances.subset(~distances.is_between_points)
+    found = distances.of_anchors
     one = np.ones(1)
     for each in others:
         if each.is_used and not each.places_map:
