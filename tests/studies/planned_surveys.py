@@ -45,9 +45,9 @@ from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_ranges import true_state
-from rangesfm.solver.bending import BENDS
+from rangesfm.solver.bending import BENDS, WalkBending
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
 
 Array = npt.NDArray[np.float64]
 
@@ -217,10 +217,11 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
         else:
-            given = (observations, trajectory, anchors, planned.anchor_frame, planned.range_model, distances)
+            bending = WalkBending(in_first_camera(trajectory))
+            given = (observations, trajectory, bending, anchors, planned.anchor_frame, planned.range_model, distances)
             posed = scale_problem(RangesOnPath(*given))
-            fit = solution_from(posed, truth(planned, posed)).fit
-            metric_from_map = fit.state.metric_from_model @ posed.first_camera_from_sfm
+            solved = solution_from(posed, truth(planned, posed))
+            metric_from_map = solved.state.metric_from_model @ first_camera_from(trajectory)
     except GeometryError as error:
         return found | {"refused": str(error)}
     found["scale"] = float(np.log(metric_from_map.scale / METRES_PER_UNIT))

@@ -59,21 +59,20 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
     path = path_of(reference)
     case = next(case for case in cases(log, anchors, path) if case.name == "known")
     observations = placed(log, case, path, described, by_photo=False)
-    posed = scale_problem(RangesOnPath(observations, path, case.anchors, case.frame))
-    solution = solve_scale(posed)
-    state = solution.fit.state
+    bending = WalkBending(in_first_camera(path))
+    posed = scale_problem(RangesOnPath(observations, path, bending, case.anchors, case.frame))
+    solved = solve_scale(posed)
+    state = solved.state
     true = replace(
         state,
         metric_from_model=replace(state.metric_from_model, scale=FACTOR),
         bias_m=posed.ranges.bias_mean_m,
     )
-    solution = replace(solution, fit=replace(solution.fit, state=true))
-    ranges = binned_ranges(posed, solution, WalkBending(in_first_camera(path)))
-    bins = ranges.bins
+    bins = binned_ranges(replace(solved, state=true)).bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))
     components = radio_components(bins, posed.curve_stddev_m)
-    given = (bins.mean(off_m), bins.mean(nothing_open), np.ones((1, 1)), solution.noise_stddev_m)
+    given = (bins.mean(off_m), bins.mean(nothing_open), np.ones((1, 1)), solved.noise_stddev_m)
     learned = learn_errors(components, bins, *given)
     return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
 

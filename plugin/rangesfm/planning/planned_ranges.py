@@ -23,9 +23,9 @@ from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale, bins_on
 from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
-from rangesfm.measurements.ranges.scale.ranges_on_map import ranges_on_map
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
-from rangesfm.measurements.ranges.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
+from rangesfm.measurements.ranges.scale.solution import refuse_ambiguity, solution_from
 from rangesfm.options import LENGTH_M
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.solver.bending import MapBending
@@ -52,17 +52,17 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     path, first_camera = planned.trajectory, first_camera_from(planned.trajectory)
     into = first_camera if planned.anchor_frame == "first_camera" else IDENTITY
     told = [replace(a, position_m=into.apply(at)) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)]
-    given = RangesOnPath(_observations(planned), path, told, planned.anchor_frame, planned.range_model)
-    ranges = RangesToSolve(given, bending)
+    given = RangesOnPath(_observations(planned), path, bending, told, planned.anchor_frame, planned.range_model)
+    ranges = RangesToSolve(given)
     posed = ranges.posed(others)
     state = true_state(planned, posed)
     tags_m, placing_m = antenna_positions(posed.ranges, state.metric_from_model), posed.placing_stddev_m(1.0)
     noise_m = planned.given_sizes.get("white", START_STDDEV_M)
     stddev_m = np.sqrt(noise_m**2 + placing_m**2 + posed.errors.shared_m**2)
     errors = replace(posed.errors.at(tags_m, placing_m), stddev_m=stddev_m)
-    problem = weighted(posed.ranges, errors)
-    fit = fit_at(problem, state, np.full(len(posed.rows), float(planned.num_alike)))
-    return ranges.solved(posed, Solution(problem, fit, errors, noise_m))
+    weighted = posed.weighted(errors)
+    fit = fit_at(weighted, state, np.full(len(posed.rows), float(planned.num_alike)))
+    return ranges.solved(RangesOnMap.at(posed, weighted, fit, errors, noise_m))
 
 
 def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
@@ -70,7 +70,7 @@ def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
     ids, first_camera = [anchor.anchor_id for anchor in planned.anchors], first_camera_from(planned.trajectory)
     places_m = _standing_m(planned)[[ids.index(anchor_id) for anchor_id in posed.observations.log.anchor_ids]]
     biases_m = posed.ranges.bias_mean_m.copy()
-    if posed.frame == "site":
+    if posed.ranges.frame_is_free:
         return RangeState(first_camera.inverse(), places_m, biases_m)
     return RangeState(IDENTITY, first_camera.apply(places_m), biases_m)
 
@@ -101,10 +101,10 @@ def turned_out(on_map: JointMap, seed: int) -> RangeObservations:
     """Return the planned ranges on a map with errors drawn from those to expect."""
     ranges = find_kind(on_map.kinds, RangeScale)
     assert ranges is not None, "a plan with ranges"
-    posed, noise, rng = ranges.posed, on_map.problem.noise_of(RANGES), np.random.default_rng(seed)
+    posed, noise, rng = ranges.solved.posed, on_map.problem.noise_of(RANGES), np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(noise.without("white").covariance_m2)
     of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-    white_m = noise.stddev_of_component["white"] / np.sqrt(ranges.solution.fit.weights)
+    white_m = noise.stddev_of_component["white"] / np.sqrt(ranges.solved.weights)
     range_m = posed.observations.log.range_m.copy()
     range_m[posed.rows] += of_bins[bins_on(on_map).of_range] + white_m * rng.standard_normal(len(posed.rows))
     log = replace(posed.observations.log, range_m=np.maximum(range_m, LENGTH_M.least))
@@ -117,16 +117,16 @@ def why_place_is_open(on_map: JointMap) -> str:
     It is open if the map's mirror image in the anchors' plane fits ranges as they may turn out.
     """
     ranges = find_kind(on_map.kinds, RangeScale)
-    if ranges is None or not ranges.places_map or ranges.posed.ranges.placement is not None:
+    if ranges is None or not ranges.places_map or ranges.solved.problem.placement is not None:
         return ""
-    state = ranges.solution.fit.state
-    mirrored = mirrored_map(ranges.posed.ranges, state)
+    state, given = ranges.solved.state, ranges.solved.posed.given
+    mirrored = mirrored_map(ranges.solved.problem, state)
     if mirrored is None:
         return ""
     try:
         # For a path in that plane the height is not determined, and the solver divides 0 by 0.
         with np.errstate(invalid="ignore", divide="ignore"):
-            posed = scale_problem(replace(ranges.posed.given, observations=turned_out(on_map, 0)))
+            posed = scale_problem(replace(given, observations=turned_out(on_map, 0)))
             return refuse_ambiguity(solution_from(posed, state), [mirrored], None)
     except GeometryError as error:
         return str(error)
@@ -140,8 +140,8 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     ranges = find_kind(on_map.kinds, RangeScale)
     if ranges is None:
         return ()
-    here, bins = ranges_on_map(ranges.posed, ranges.solution, ranges.bending), bins_on(on_map)
-    joint = joined([in_bins(here, bins, ranges.solution.noise_stddev_m, {}, np.zeros(len(bins)))], here.bending)
+    here, bins = ranges.solved, bins_on(on_map)
+    joint = joined([in_bins(here, bins, here.noise_stddev_m, {}, np.zeros(len(bins)))], here.bending)
     problem = Linearized(**vars(joint), on_map=here, bins=bins, scatter_m=0.0)
     found = []
     for test in Factorization(problem).estimates([each for of_kind in STANDING for each in of_kind(problem)]):

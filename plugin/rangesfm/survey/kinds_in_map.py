@@ -74,13 +74,13 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
     if inputs.tape.distances:
         distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
     given = RangesOnPath(
-        *(at.observations, at.path, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
+        *(at.observations, at.path, at.bending, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
         gravity=gravity_of(survey.scale.up_in_first_camera),
         camera_side=survey.scale.camera_side,
         site=inputs.site,
         seed=survey.output.seed,
     )
-    return RangesToSolve(given, at.bending)
+    return RangesToSolve(given)
 
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:

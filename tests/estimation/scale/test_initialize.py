@@ -392,7 +392,7 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     # The judged problem holds the scale no better than the lengths do in a map that bends.
     lengths, posed = (
         known(find_kind(held.kinds, LengthScale)),
-        known(find_kind(held.kinds, RangeScale)).posed.ranges.distances,
+        known(find_kind(held.kinds, RangeScale)).solved.problem.distances,
     )
     assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
 

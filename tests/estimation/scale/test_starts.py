@@ -21,8 +21,10 @@ from rangesfm.measurements.ranges.scale.starts import (
     site_starts,
     sphere_swaps,
 )
+from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, path_shape
+from rangesfm.util.geometry.trajectory import in_first_camera
 
 if TYPE_CHECKING:
     from tests.estimation.scale.conftest import MakeSurvey, Survey
@@ -48,7 +50,9 @@ def placed_at(similarity: Similarity, num: int = 60, gravity: Gravity | None = N
 
 def unknown_anchors(survey: Survey) -> RangeProblem:
     anchors = survey.anchors("unknown", "")
-    return scale_problem(RangesOnPath(survey.observations(), survey.trajectory, anchors, "unknown")).ranges
+    bending = WalkBending(in_first_camera(survey.trajectory))
+    given = RangesOnPath(survey.observations(), survey.trajectory, bending, anchors, "unknown")
+    return scale_problem(given).ranges
 
 
 @pytest.mark.parametrize("seed", range(4))

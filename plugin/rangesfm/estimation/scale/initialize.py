@@ -74,13 +74,13 @@ def initialize_scale(
     """
     bending = bending or WalkBending(in_first_camera(trajectory))
     given = RangesOnPath(
-        *(observations, trajectory, anchors, anchor_frame, range_model, distances),
+        *(observations, trajectory, bending, anchors, anchor_frame, range_model, distances),
         gravity=gravity_of(options.up_in_first_camera),
         camera_side=options.camera_side,
         site=site,
         seed=seed,
     )
-    ranges = (RangesToSolve(given, bending),) if len(observations.log) else ()
+    ranges = (RangesToSolve(given),) if len(observations.log) else ()
     log = RangeEstimate.begun(observations, range_model)
     return estimate_scale((*ranges, *others), trajectory, bending, options, log)
 

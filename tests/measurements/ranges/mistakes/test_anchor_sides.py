@@ -67,7 +67,7 @@ def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:
 def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
     on_map = on_moved_map(crossed)
     surveyed_m = replace(on_map.problem, anchor_mean_m=on_map.state.anchors_m, anchor_stddev_m=np.array([0.02]))
-    assert likelier_sides(replace(on_map, problem=surveyed_m)).mirrors_m == {}
+    assert likelier_sides(on_map.with_problem(surveyed_m)).mirrors_m == {}
 
 
 def test_a_path_that_goes_up_and_down_leaves_nothing_open() -> None:

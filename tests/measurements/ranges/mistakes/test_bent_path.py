@@ -17,11 +17,10 @@ from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.options import ScaleOptions
-from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points, rmse
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 TAG_IN_CAM_M = (0.0, 0.0, 0.0)
 ANCHOR_M = np.array([8.0, -6.0, 0.3])
@@ -45,8 +44,7 @@ def mown(seed: int) -> RangesOnMap:
     log = RangeLog.from_arrays(np.full(len(at_s), "A"), np.maximum(range_m, 0.1), timestamp_s=at_s)
     anchors = [Anchor("A", None)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="unknown")
-    ranges = known(find_kind(found.kinds, RangeScale))
-    return ranges_on_map(ranges.posed, ranges.solution, WalkBending(in_first_camera(path)))
+    return known(find_kind(found.kinds, RangeScale)).solved
 
 
 @pytest.mark.parametrize("seed", [3, 5])

@@ -16,6 +16,7 @@ from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.solver.bending import Bending
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import OnPath
@@ -64,30 +65,42 @@ def small_map(
         share=np.ones(num),
     )
     state = RangeState(PLACED, ANCHORS_M.copy(), problem.bias_mean_m)
-    posed: Any = SimpleNamespace(
+    problem = replace(problem, range_m=predicted_ranges(problem, state))
+    given: Any = SimpleNamespace(
         observations=SimpleNamespace(
             log=SimpleNamespace(
-                anchor_ids=("A", "B", "C"), tag_ids=("T", "U")[:num_tags], tag_index=np.append(tag_index, 7)
+                anchor_ids=("A", "B", "C"),
+                tag_ids=("T", "U")[:num_tags],
+                tag_index=np.append(tag_index, 7),
+                shared_stddev_m=np.full(num, np.nan),
             ),
             on_path=lambda rows: OnPath(points[rows], points[rows] + 1, np.zeros(len(rows))),
+            placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         ),
-        rows=np.arange(num),
-        curve_stddev_m=np.full(num, np.nan),
-        placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         site=Site(),
         trajectory=range(int(points.max()) + 2),
     )
+    errors: Any = None
     rigid: Any = SimpleNamespace(
         of_functions=lambda by_pose, frame_is_free: Bending((), np.zeros((len(by_pose),) * 2), np.zeros(len(by_pose)))
     )
     return RangesOnMap(
-        posed=posed,
-        problem=replace(problem, range_m=predicted_ranges(problem, state)),
+        posed=ScaleProblem(
+            given=given,
+            ranges=problem,
+            model_from_cam=model_from_cam,
+            velocity=velocity if has_times else None,
+            errors=errors,
+            rows=np.arange(num),
+            notes=(),
+            left_out=(),
+        ),
+        weighted=problem,
         state=state,
-        model_from_cam=model_from_cam,
-        velocity=velocity if has_times else None,
         time_s=np.asarray(BEGIN_S + seconds),
         weights=np.ones(num),
+        errors=errors,
+        noise_stddev_m=0.0,
         bending=rigid,
     )
 
@@ -137,7 +150,7 @@ class TestDerivatives:
         problem = linearized(on_map)
 
         def residual_m(arm_m: Array) -> Array:
-            tags = on_map.problem.tag_from_center + on_map.model_from_cam @ arm_m
-            return problem.bins.mean(replace(on_map, problem=replace(on_map.problem, tag_from_center=tags)).residual_m)
+            tags = on_map.problem.tag_from_center + on_map.posed.model_from_cam @ arm_m
+            return problem.bins.mean(on_map.with_problem(replace(on_map.problem, tag_from_center=tags)).residual_m)
 
         np.testing.assert_allclose(problem.by_lever_arm, slopes(residual_m, 3), atol=1e-7)

@@ -66,10 +66,10 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     """Yield all mistakes without a size that a map can have."""
     given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
-    yield from _of_labels([name for name in on_map.posed.order_given if name in given], given)
+    yield from _of_labels([each.anchor_id for each in on_map.posed.given.anchors if each.anchor_id in given], given)
     yield from _of_coordinates(given)
     yield from _of_places(on_map, given)
-    if on_map.velocity is not None:  # as where the photos' order was taken from names that count down
+    if on_map.posed.velocity is not None:  # as where the photos' order was taken from names that count down
         times = on_map.time_s
         yield Hypothesis.without_size(
             "photos reversed",
@@ -83,7 +83,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
 
 def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
-    in_cam_m = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
+    in_cam_m = np.einsum("nji,nj->ni", on_map.posed.model_from_cam, on_map.problem.tag_from_center)
     tag_index = on_map.tag_index
     arms = {on_map.tag_ids[k]: np.median(in_cam_m[tag_index == k], axis=0) for k in np.unique(tag_index)}
     for words, given in _AXES_OF_LEVER_ARM.items():
@@ -168,7 +168,7 @@ def best_refits(
 
     def thinned(on_map: RangesOnMap) -> RangeProblem:
         thin = on_map.problem.subset(rows)
-        return replace(thin, stddev_m=np.full(len(thin.range_m), scatter_m))
+        return replace(thin, stddev_m=np.full(len(rows), scatter_m), share=np.ones(len(rows)))
 
     usually_seen, starts = _anchors_by_map(thinned(on_map)), []
     for each in tried:

@@ -101,15 +101,9 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
 
 def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
     """Return the ranges moved along from one path to another."""
-    at, turned = on_map.on_path, after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
-    turn = turned[at.nearest]
-    return replace(
-        on_map,
-        problem=on_map.problem.carried(at, turned, after.path.centers - before.path.centers),
-        model_from_cam=turn @ on_map.model_from_cam,
-        velocity=None if on_map.velocity is None else np.einsum("nij,nj->ni", turn, on_map.velocity),
-        bending=after,
-    )
+    turns = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
+    posed = on_map.posed.carried(turns, after.path.centers - before.path.centers)
+    return replace(on_map, posed=posed, bending=after)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
 
 def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
-    site = problem.on_map.posed.site
+    site = problem.on_map.posed.given.site
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
     most_m = longest_m(problem, [k]) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
@@ -198,7 +198,7 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
     if len(known) < 3 or np.ptp(given_m[known, 2]) > SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
         return
-    up, site = np.array([0.0, 0.0, 1.0]), problem.on_map.posed.site
+    up, site = np.array([0.0, 0.0, 1.0]), problem.on_map.posed.given.site
     yield Hypothesis(
         "anchor heights",
         np.hstack([of_anchor_place(problem, k, up[:, None]) for k in known]),
@@ -257,7 +257,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the radio's delay changes steadily, by more than radios drift."""
     since = problem.on_map.time_s - problem.time_s.mean()
-    lasts, unit = float(np.ptp(since)), "m of the path" if problem.on_map.velocity is None else "s"
+    lasts, unit = float(np.ptp(since)), "m of the path" if problem.on_map.posed.velocity is None else "s"
 
     def words(size: Array) -> str:
         how = "longer" if size[0] > 0 else "shorter"
@@ -290,7 +290,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
 
 def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the offset or the rate between the clocks of camera and radio differs from what is assumed."""
-    if problem.on_map.velocity is None:
+    if problem.on_map.posed.velocity is None:
         return
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
     by_time = problem.bins.mean(problem.on_map.by_time)

@@ -170,16 +170,23 @@ def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
         mean_m[k] = np.full(3, np.nan) if position is None else position
         anchors_m[k] = where_ranges_meet(on_map, k) if position is None else position
         stddevs_m[k] = np.inf if position is None else stddevs_m[k]
-    problem = replace(problem, anchor_mean_m=mean_m, anchor_stddev_m=stddevs_m)
-    on_map = replace(on_map, problem=problem, state=replace(on_map.state, anchors_m=anchors_m))
-    if on_map.velocity is not None and np.any(correction.time_shift_s):
-        on_map = _taken_later(on_map, np.broadcast_to(correction.time_shift_s, len(on_map.time_s)), on_map.velocity)
-    problem = replace(on_map.problem, range_m=on_map.problem.range_m - correction.longer_m)
+    on_map = replace(on_map, state=replace(on_map.state, anchors_m=anchors_m)).with_problem(
+        replace(
+            problem,
+            anchor_mean_m=mean_m,
+            anchor_stddev_m=stddevs_m,
+            range_m=problem.range_m - correction.longer_m,
+        )
+    )
+    if on_map.posed.velocity is not None and np.any(correction.time_shift_s):
+        shift_s = np.broadcast_to(correction.time_shift_s, len(on_map.time_s))
+        on_map = _taken_later(on_map, shift_s, on_map.posed.velocity)
     if correction.tag_moves_m:
         moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in on_map.tag_ids])
-        turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])
-        problem = replace(problem, tag_from_center=problem.tag_from_center + turned)
-    return replace(on_map, problem=problem)
+        turned = np.einsum("nij,nj->ni", on_map.posed.model_from_cam, moves[on_map.tag_index])
+        problem = on_map.problem
+        on_map = on_map.with_problem(replace(problem, tag_from_center=problem.tag_from_center + turned))
+    return on_map
 
 
 def where_ranges_meet(on_map: RangesOnMap, k: int) -> Array:
@@ -199,12 +206,9 @@ def _taken_later(on_map: RangesOnMap, shift_s: Array, velocity: Array) -> Ranges
     rising_s = on_map.time_s[order]
     after = np.clip(np.searchsorted(rising_s, taken_s), 1, len(order) - 1)
     at = order[np.where(taken_s - rising_s[after - 1] < rising_s[after] - taken_s, after - 1, after)]
-    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, problem.tag_from_center)
-    turned = on_map.model_from_cam[at]
+    arms = np.einsum("nji,nj->ni", on_map.posed.model_from_cam, problem.tag_from_center)
+    turned = on_map.posed.model_from_cam[at]
     centers = problem.centers[at] + velocity[at] * (taken_s - on_map.time_s[at])[:, None]
-    return replace(
-        on_map,
-        problem=replace(problem, centers=centers, tag_from_center=np.einsum("nij,nj->ni", turned, arms)),
-        model_from_cam=turned,
-        velocity=velocity[at],
-    )
+    ranges = replace(problem, centers=centers, tag_from_center=np.einsum("nij,nj->ni", turned, arms))
+    posed = replace(on_map.posed, ranges=ranges, model_from_cam=turned, velocity=velocity[at])
+    return replace(on_map, posed=posed)

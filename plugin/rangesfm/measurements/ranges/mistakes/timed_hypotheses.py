@@ -178,7 +178,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
 
 def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the clocks' offset jumped at some time."""
-    if problem.on_map.velocity is None:
+    if problem.on_map.posed.velocity is None:
         return iter(())
     by_time = problem.bins.mean(problem.on_map.by_time)
 
@@ -267,7 +267,7 @@ def _shares_after(problem: Linearized, times: Array) -> Array:
 
 def _when(problem: Linearized, start: float, end: float = np.inf) -> str:
     begin = problem.on_map.time_s.min()
-    what = "m along the path" if problem.on_map.velocity is None else "s after the first range"
+    what = "m along the path" if problem.on_map.posed.velocity is None else "s after the first range"
     span = f"from {start - begin:.0f} to {end - begin:.0f}" if np.isfinite(end) else f"{start - begin:.0f}"
     return f"{span} {what}"
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.ranges.scale.range_equation import RangeFit, RangeProblem, RangeState
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
 from rangesfm.util.geometry.gravity import UP_IN_SITE
 from rangesfm.util.geometry.similarity import PathShape, Similarity, path_shape
 
@@ -107,16 +107,16 @@ def is_on_side(problem: RangeProblem, state: RangeState, camera_side: str | None
     return camera_side is None or camera_side_of(problem, state) in (camera_side, None)
 
 
-def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
-    """Return the fits whose path is on the given side of the anchors' plane or in it; all fits if there is no plane.
+def on_side(problem: RangeProblem, states: list[RangeState], camera_side: str | None) -> list[RangeState]:
+    """Return the states whose path is on the given side of the anchors' plane or in it; all if there is no plane.
 
     Raises:
-        GeometryError: the plane is upright, or no fit is on that side.
+        GeometryError: the plane is upright, or no state is on that side.
     """
-    kept = [fit for fit in fits if is_on_side(problem, fit.state, camera_side)]
-    if fits and not kept:
+    kept = [state for state in states if is_on_side(problem, state, camera_side)]
+    if states and not kept:
         raise GeometryError(
-            f"the ranges put the camera {camera_side_of(problem, fits[0].state)} the anchors' plane, not "
+            f"the ranges put the camera {camera_side_of(problem, states[0])} the anchors' plane, not "
             f"{camera_side} as said: check camera_side and the anchors' heights"
         )
     return kept

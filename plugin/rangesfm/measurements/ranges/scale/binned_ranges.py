@@ -12,15 +12,12 @@ from rangesfm.measurements.ranges.errors.components import CLOCKS, OtherError
 from rangesfm.measurements.ranges.errors.learned import widened
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.scale.range_equation import (
-    fit_at,
     prior_jacobian,
     prior_residuals,
     state_after,
 )
-from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import Solution
-from rangesfm.solver.bending import BENDS, MapBending
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.solver.bending import BENDS
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Noise
 from rangesfm.solver.posterior import Observations, Posterior
 
@@ -38,26 +35,20 @@ class BinnedRanges(Observations):
     bins: RangeBins = field(kw_only=True)
 
 
-def binned_ranges(
-    posed: ScaleProblem, solution: Solution, bending: MapBending, max_num_bins: int = MAX_NUM_OBSERVATIONS
-) -> BinnedRanges:
-    """Average the ranges of a problem, and linearise them about its solution.
+def binned_ranges(on_map: RangesOnMap, max_num_bins: int = MAX_NUM_OBSERVATIONS) -> BinnedRanges:
+    """Average ranges in bins, and linearise them about their solution.
 
     Args:
-        bending: of the map.
         max_num_bins: fewer bins are coarser and take less time.
     """
-    on_map, fit = ranges_on_map(posed, solution, bending), solution.fit
-    others_m2 = dict[OtherError, Array]()
-    own = on_map.problem.without_others()
-    on_map = replace(on_map, problem=own)
-    noise_of_anchor = noisiness(own.anchor_index, fit.residuals_m, own.num_anchors)
-    bins = on_map.bins(fit.weights, noise_of_anchor, max_num_bins)
-    if on_map.velocity is not None and (clock_s := posed.observations.time_offset_stddev_s):
-        rates = bins.mean(on_map.by_time)
+    own, others_m2 = on_map.with_problem(on_map.problem.without_others()), dict[OtherError, Array]()
+    noise_of_anchor = noisiness(own.problem.anchor_index, own.fit_residual_m, own.problem.num_anchors)
+    bins = own.bins(own.weights, noise_of_anchor, max_num_bins)
+    if own.posed.velocity is not None and (clock_s := own.posed.observations.time_offset_stddev_s):
+        rates = bins.mean(own.by_time)
         others_m2[CLOCKS] = clock_s**2 * np.outer(rates, rates)
-    alone_m2 = 1 / np.maximum(bins.total(fit.weights / solution.errors.stddev_m**2), 1e-12)
-    return in_bins(on_map, bins, solution.noise_stddev_m, others_m2, alone_m2)
+    alone_m2 = 1 / np.maximum(bins.total(own.weights / own.errors.stddev_m**2), 1e-12)
+    return in_bins(own, bins, own.noise_stddev_m, others_m2, alone_m2)
 
 
 def in_bins(
@@ -72,7 +63,7 @@ def in_bins(
     return BinnedRanges(
         **vars(on_map.linearized(bins)),
         kind=RANGES,
-        by_pose=bins.by_pose(on_map.by_poses, len(on_map.posed.trajectory)),
+        by_pose=bins.by_pose(on_map.by_poses, len(on_map.posed.given.trajectory)),
         components=widened(on_map.errors_of(bins, others_m2), noise_m),
         alone_m2=np.diag(alone_m2),
         is_used=np.ones(len(bins), dtype=bool),
@@ -80,34 +71,33 @@ def in_bins(
     )
 
 
-def moved(solution: Solution, known: Posterior) -> Solution:
-    """Return the solution moved to the estimate of a posterior about it, with the same robust weights.
+def moved(on_map: RangesOnMap, known: Posterior) -> RangesOnMap:
+    """Return the ranges at the estimate of a posterior about their state, with the same robust weights.
 
     The estimate is linear. An anchor that moves by much across a length that was surveyed would change it, so that the
     anchors make one more step to where the priors are as the estimate has them.
     """
-    problem, before, columns = solution.problem, solution.fit.state, known.columns
-    own = replace(problem.without_others(), bias_stddev_m=np.zeros(problem.num_anchors))
-    slopes = prior_jacobian(own, columns, before, before)
+    problem, before, columns = on_map.weighted.without_others(), on_map.state, known.columns
+    problem = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors))
+    slopes = prior_jacobian(problem, columns, before, before)
     state = state_after((columns,), before, known.step)
-    linear = prior_residuals(own, columns, before) + slopes @ known.step
-    again = known.covariance @ slopes.T @ (linear - prior_residuals(own, columns, state))
+    linear = prior_residuals(problem, columns, before) + slopes @ known.step
+    again = known.covariance @ slopes.T @ (linear - prior_residuals(problem, columns, state))
     again[columns.of_map] = 0.0
-    state = state_after((columns,), before, known.step + again)
-    return replace(solution, fit=fit_at(problem, state, solution.fit.weights))
+    return replace(on_map, state=state_after((columns,), before, known.step + again))
 
 
-def shared_errors_m(solution: Solution, noise: Noise, bins: RangeBins) -> Array:
+def shared_errors_m(on_map: RangesOnMap, noise: Noise, bins: RangeBins) -> Array:
     """Return the errors (n, k) that the n ranges of a solution share, for k independent standard deviations.
 
     They are the principal axes of the learnt errors, in units of what a bin's ranges scatter by themselves; axes along
     which the errors are smaller than that are noise to the bins anyway.
 
     Args:
-        solution: by the ranges. noise: of their bins; the errors of the map are left out, as photos see them.
+        noise: of their bins; the errors of the map are left out, as photos see them.
     """
-    covariance_m2, errors = noise.without("white", *BENDS).covariance_m2, solution.errors
-    worth = bins.total(errors.worth * solution.fit.weights / errors.stddev_m**2)
+    covariance_m2, errors = noise.without("white", *BENDS).covariance_m2, on_map.errors
+    worth = bins.total(errors.worth * on_map.weights / errors.stddev_m**2)
     scatter_m = 1 / np.sqrt(np.maximum(worth, 1e-12))
     variances, axes = np.linalg.eigh(covariance_m2 / np.outer(scatter_m, scatter_m))
     matters = variances > 1

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
-from rangesfm.measurements.ranges.scale.range_equation import RangeFit
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN, Solution
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN
 from rangesfm.solver.bending import BENDS
 from rangesfm.solver.posterior import ScaleUncertainty
 from rangesfm.util.geometry.gravity import Gravity
@@ -28,16 +28,16 @@ CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm range
 
 
 def doubts_of_ranges(
-    posed: ScaleProblem, solution: Solution, uncertainty: ScaleUncertainty, per_anchor: Mapping[str, float]
+    on_map: RangesOnMap, uncertainty: ScaleUncertainty, per_anchor: Mapping[str, float]
 ) -> Iterator[Doubt]:
     """Yield the faults of the path, of the anchors and of the ranges; ``per_anchor``: scales, by anchor id."""
-    yield from _doubts_of_survey(posed, solution, uncertainty)
-    yield from _doubts_of_fit(solution.fit, per_anchor)
+    yield from _doubts_of_survey(on_map, uncertainty)
+    yield from _doubts_of_fit(on_map.weights, per_anchor)
 
 
-def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+def _doubts_of_survey(on_map: RangesOnMap, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
     """Return the faults of the path and of the anchors."""
-    problem, half_width = solution.problem, uncertainty.half_width_95
+    problem, half_width = on_map.problem, uncertainty.half_width_95
     kind = path_kind(problem.centers)
     is_round = kind in ("circular", "spherical") and not problem.has_known_anchors
     # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
@@ -48,9 +48,9 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: Scal
         yield Doubt("ranges and photos leave the shape of the map open", overlap)
     elif half_width > NORMAL_95 * NOTHING_KNOWN:
         yield Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
-    for note in posed.notes:
+    for note in on_map.posed.notes:
         yield Doubt(note, "survey three anchors or more that are not on one line")
-    if ids := posed.left_out:
+    if ids := on_map.posed.left_out:
         which = f"anchor {ids[0]} has" if len(ids) == 1 else f"anchors {', '.join(ids)} have"
         reason = f"{which} too few ranges on the path to be placed: left out"
         yield Doubt(reason, "range more often, or survey them all")
@@ -62,11 +62,11 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: Scal
             yield Doubt("the path is nearly straight: the map's roll about it is uncertain")
 
 
-def _doubts_of_fit(fit: RangeFit, per_anchor: Mapping[str, float]) -> Iterator[Doubt]:
-    if len(fit.weights) < FEW_RANGES:
-        reason = f"only {len(fit.weights)} ranges lie on the path"
+def _doubts_of_fit(weights: Array, per_anchor: Mapping[str, float]) -> Iterator[Doubt]:
+    if len(weights) < FEW_RANGES:
+        reason = f"only {len(weights)} ranges lie on the path"
         yield Doubt(reason, "range more often, and all along the path")
-    outliers = float(np.mean(fit.weights < OUTLIER_BELOW))
+    outliers = float(np.mean(weights < OUTLIER_BELOW))
     if outliers > MANY_OUTLIERS:
         reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
         yield Doubt(reason, "place the anchors where nothing stands between them and the path")
@@ -77,9 +77,9 @@ def _doubts_of_fit(fit: RangeFit, per_anchor: Mapping[str, float]) -> Iterator[D
             yield Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")
 
 
-def remarks_on_anchors(solution: Solution, anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
+def remarks_on_anchors(on_map: RangesOnMap, anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
     """Yield what is not determined but does not affect the scale."""
-    stddevs = path_shape(solution.problem.centers).stddevs
+    stddevs = path_shape(on_map.problem.centers).stddevs
     if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
         return
     reason = "the path is nearly flat: nothing tells on which side of it the unknown anchors stand (the scale is right)"

@@ -31,7 +31,6 @@ from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.util.geometry.rotations import left_jacobians
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
-from rangesfm.util.geometry.trajectory import OnPath
 
 _MAX_NUM_EVALUATIONS = 100
 
@@ -81,20 +80,6 @@ class RangeProblem:
     def has_known_anchors(self) -> bool:
         """Whether any anchor with ranges has a given position."""
         return bool(np.isfinite(self.anchor_stddev_m[self.anchor_index]).any())
-
-    def carried(self, on_path: OnPath, turns: Array, shifts: Array) -> RangeProblem:
-        """Return the ranges on a path that was bent.
-
-        Args:
-            on_path: their places on it. turns, shifts: (k, 3, 3) and (k, 3) of its keyframes, in the model's world.
-        """
-        at, share = on_path, on_path.fraction[:, None]
-        turn = turns[at.nearest]
-        return replace(
-            self,
-            centers=self.centers + (1 - share) * shifts[at.before] + share * shifts[at.after],
-            tag_from_center=np.einsum("nij,nj->ni", turn, self.tag_from_center),
-        )
 
     @cached_property
     def uncertain(self) -> tuple[Indices, Indices]:
@@ -215,14 +200,6 @@ class RangeFit:
         diagonal = np.sqrt(np.maximum(np.diag(self.information), 1e-200))
         values, vectors = np.linalg.eigh(self.information / np.outer(diagonal, diagonal))
         return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))
-
-    def of_anchors(self, covariance: Array) -> Array:
-        """Return the (m, 3, 3) parts of the anchors in a (p, p) covariance; 0 for anchors that are not estimated."""
-        parts = np.zeros((len(self.state.anchors_m), 3, 3))
-        for k, column in enumerate(self.columns[0].anchor):
-            if column >= 0:
-                parts[k] = covariance[column : column + 3, column : column + 3]
-        return parts
 
 
 def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:

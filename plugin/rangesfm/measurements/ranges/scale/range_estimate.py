@@ -16,42 +16,41 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
     RangeState,
     predicted_ranges,
-    range_gradient,
     solve,
 )
-from rangesfm.measurements.ranges.scale.scale_problem import MIN_RANGES, ScaleProblem
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.scale_problem import MIN_RANGES
 from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, ScaleSensitivity
-from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.measurements.ranges.scale.starts import choose_sides
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import RangeModelOptions
+from rangesfm.solver.posterior import Posterior
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.util.geometry.similarity import Similarity
 
 
-def scale_sensitivity(solution: Solution, posed: ScaleProblem, by_bins: Array, bins: RangeBins) -> ScaleSensitivity:
+def scale_sensitivity(on_map: RangesOnMap, by_bins: Array, bins: RangeBins) -> ScaleSensitivity:
     """Return the changes of the scale in percent, to first order.
 
     Args:
         by_bins: (c,) change of the scale's logarithm per metre that each bin is longer.
-        bins: of the problem's ranges.
+        bins: of the ranges.
     """
-    problem, state = solution.problem, solution.fit.state
+    problem = on_map.problem
 
     def percent(range_error_m: Array) -> float:
         return 100 * float(by_bins @ bins.mean(range_error_m))
 
-    distance, centimetre = predicted_ranges(problem, state), 0.01
-    world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam
-    along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
+    distance, centimetre = predicted_ranges(problem, on_map.state), 0.01
+    along_x, along_y, along_z = on_map.gradient.by_tag_in_cam(on_map.world_from_cam).T
     return ScaleSensitivity(
         common_bias_per_cm=percent(np.full(len(distance), centimetre)),
         # Rounding spreads ranges of one length, of which none is a shorter one.
         short_range_per_cm=percent(np.where(distance < (1 - ROUNDING) * np.median(distance), centimetre, 0.0)),
         anchor_bias_per_cm={
             anchor_id: percent(np.where(problem.anchor_index == k, centimetre, 0.0))
-            for k, anchor_id in enumerate(posed.observations.log.anchor_ids)
+            for k, anchor_id in enumerate(on_map.anchor_ids)
         },
         range_slope_per_percent=percent(0.01 * distance),
         # A tag further out than assumed lengthens the measured ranges, which then stretch the map.
@@ -104,54 +103,46 @@ class RangeEstimate:
 _MAX_LOG_SCALE_STDDEV = 0.5
 
 
-def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[str, float]:
+def scale_per_anchor(on_map: RangesOnMap) -> dict[str, float]:
     """Estimate the scale from the ranges of one anchor at a time; by anchor id.
 
     With a known anchor the path is stretched about its centre, or about the first camera where that is the frame's
     origin. An unknown anchor is estimated along with the scale.
     """
-    problem, state, scales = solution.problem, solution.fit.state, {}
+    problem, state, scales = on_map.weighted, on_map.state, {}
     middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
     placed = replace(state.metric_from_model, translation=state.metric_from_model.apply(middle))
-    for k, anchor_id in enumerate(anchor_ids):
+    for k, anchor_id in enumerate(on_map.anchor_ids):
         part = problem.of_anchor(k)
         if len(part.range_m) < MIN_RANGES:
             continue
         alone = replace(part, centers=part.centers - middle)
         start = RangeState(placed, state.anchors_m[k : k + 1], state.bias_m[k : k + 1])
         fit = solve(alone, start, loss=GEMAN_MCCLURE)
-        if fit.log_scale_stddev * solution.errors.inflation < _MAX_LOG_SCALE_STDDEV:
+        if fit.log_scale_stddev * on_map.errors.inflation < _MAX_LOG_SCALE_STDDEV:
             scales[anchor_id] = fit.state.metric_from_model.scale
     return scales
 
 
-def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance: Array) -> tuple[AnchorEstimate, ...]:
-    """Return the estimates of all anchors of the log, mirror places included.
-
-    Args:
-        covariance: (p, p) covariance of the map and its anchors, as in ``KnownMap``.
-    """
-    problem, state = solution.problem, solution.fit.state
-    of_anchors = solution.fit.of_anchors(covariance)
-    stddev = np.sqrt(np.trace(of_anchors, axis1=1, axis2=2) / 3)
-    mirrors = _mirror_places(solution)
-    common_bias_m = _common_bias(problem, state)
-    estimates = []
-    for k, anchor_id in enumerate(anchor_ids):
-        known = bool(np.isfinite(problem.anchor_mean_m[k]).all())
+def anchor_estimates(on_map: RangesOnMap, known: Posterior) -> tuple[AnchorEstimate, ...]:
+    """Return the estimates of all anchors of the log, mirror places included, on the map moved to a posterior."""
+    problem, state, mirrors = on_map.weighted, on_map.state, _mirror_places(on_map)
+    common_bias_m, estimates = _common_bias(problem, state), []
+    for k, (anchor_id, column) in enumerate(zip(on_map.anchor_ids, known.columns.anchor.tolist(), strict=True)):
+        covariance_m2 = known.covariance[column : column + 3, column : column + 3] if column >= 0 else np.zeros((3, 3))
         heard = bool(np.any(problem.anchor_index == k))
         estimates.append(
             AnchorEstimate(
                 anchor_id=anchor_id,
                 position_m=state.anchors_m[k] if heard else problem.anchor_mean_m[k],
-                position_stddev_m=float(stddev[k]),
-                prior_position_m=problem.anchor_mean_m[k] if known else None,
+                position_stddev_m=float(np.sqrt(np.trace(covariance_m2) / 3)),
+                prior_position_m=problem.anchor_mean_m[k] if np.isfinite(problem.anchor_mean_m[k]).all() else None,
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
                 range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
                 prior_bias_m=float(problem.bias_mean_m[k]),
-                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * solution.errors.inflation),
+                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * on_map.errors.inflation),
                 mirror_position_m=mirrors.get(k),
-                position_covariance_m2=of_anchors[k],
+                position_covariance_m2=covariance_m2,
             )
         )
     return tuple(estimates)
@@ -167,11 +158,10 @@ def _common_bias(problem: RangeProblem, state: RangeState) -> float:
     return float(weights @ off / (weights.sum() + 1 / problem.common_bias_stddev_m**2))
 
 
-def _mirror_places(solution: Solution) -> dict[int, Array]:
+def _mirror_places(on_map: RangesOnMap) -> dict[int, Array]:
     """Return the mirror places, by index, of unknown anchors that may stand on either side of the path's plane."""
-    found_m = solution.fit.state.anchors_m
-    chosen, others_m, rise = choose_sides(solution.problem, solution.fit.state)
+    chosen, others_m, rise = choose_sides(on_map.weighted, on_map.state)
     sides_m = np.stack([chosen.anchors_m, others_m])
-    is_open = rise / solution.errors.inflation**2 < MIN_COST_GAP
-    farther = np.argmax(np.linalg.norm(sides_m - found_m, axis=2), axis=0)
+    is_open = rise / on_map.errors.inflation**2 < MIN_COST_GAP
+    farther = np.argmax(np.linalg.norm(sides_m - on_map.state.anchors_m, axis=2), axis=0)
     return {int(k): sides_m[farther[k], k] for k in np.flatnonzero(is_open)}

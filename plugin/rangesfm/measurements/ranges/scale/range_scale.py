@@ -26,18 +26,16 @@ from rangesfm.measurements.ranges.scale.doubts import (
     remarks_on_anchors,
     remarks_on_places,
 )
-from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, solve
 from rangesfm.measurements.ranges.scale.range_estimate import (
     RangeEstimate,
     anchor_estimates,
     scale_per_anchor,
     scale_sensitivity,
 )
-from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap, ranges_on_map
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import Solution, with_unknown_anchors
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.solution import with_unknown_anchors
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
+from rangesfm.solver.bending import NO_STEPS, FrameSteps
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Posterior, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
@@ -50,17 +48,15 @@ class RangeScale(KindOnMap):
     """Ranges on a map, at the solution of their problem beside the other kinds.
 
     Attributes:
-        posed: the scale problem. solution: the state of the map, with its errors.
-        path: of the map. unit: of it in the units of the problem, which has the same path. bending: of the map.
+        solved: the ranges at their solution.
+        path: of the map. unit: of it in the units of the problem, which has the same path.
         told: what is said of the ranges, as far as it is known.
         notes: as of ``KindOnMap``.
     """
 
-    posed: ScaleProblem
-    solution: Solution
+    solved: RangesOnMap
     path: Trajectory
     unit: float
-    bending: MapBending
     told: RangeEstimate
     notes: tuple[str, ...] = ()
 
@@ -73,33 +69,34 @@ class RangeScale(KindOnMap):
     @property
     def places_map(self) -> bool:
         """Whether the frame is that of surveyed anchors."""
-        return self.posed.ranges.frame_is_free
+        return self.solved.problem.frame_is_free
 
     def observed(
         self, placed: Similarity, *, in_site: bool = False, max_num: int = MAX_NUM_OBSERVATIONS
     ) -> BinnedRanges:
         """Linearise the ranges about their solution, which is at the placement."""
         del placed, in_site
-        return binned_ranges(self.posed, self.solution, self.bending, max_num)
+        return binned_ranges(self.solved, max_num)
 
     @property
     def start(self) -> Similarity:
         """The placement of the solution."""
-        placed = self.solution.fit.state.metric_from_model
-        return placed @ replace(IDENTITY, scale=self.unit) @ first_camera_from(self.path)
+        unit = replace(IDENTITY, scale=self.unit)
+        return self.solved.state.metric_from_model @ unit @ first_camera_from(self.path)
 
     @cached_property
     def alone(self) -> JointMap:
         """The map by the ranges alone, solved again from here."""
-        own = self._without_others
-        return join_kinds((own,), self.path, own.start, self.bending)
+        own = replace(self, solved=self._without_others)
+        return join_kinds((own,), self.path, own.start, self.solved.bending)
 
     @cached_property
-    def _without_others(self) -> RangeScale:
-        if self.posed.ranges.placement is None and not self.posed.ranges.distances.is_between_points.any():
-            return self
-        posed = replace(self.posed, ranges=_ranges_alone(self.posed.ranges))
-        return replace(self, posed=posed, solution=_solved(self.solution, _ranges_alone(self.solution.problem)))
+    def _without_others(self) -> RangesOnMap:
+        problem = self.solved.problem
+        if problem.placement is None and not problem.distances.is_between_points.any():
+            return self.solved
+        is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
+        return self.solved.solved(lambda problem: replace(problem.without_others(), frame_is_free=is_free))
 
     def with_their_share(self) -> RangeScale:
         """Return the ranges solved beside other kinds with all of them weighted by how well they know the scale.
@@ -107,51 +104,49 @@ class RangeScale(KindOnMap):
         That is the formal over the learnt variance of the scale by ranges alone, at most 1. Where ranges alone say
         nothing of the scale, they keep a share that has no effect: with none at all, nothing would place the anchors.
         """
-        alone, problem, known = self._without_others.solution, self.solution.problem, self.alone.scale
-        formal = alone.fit.log_scale_stddev * alone.errors.inflation
+        alone, known = self._without_others, self.alone.scale
+        formal = alone.log_scale_stddev * alone.errors.inflation
         share = float(np.clip((formal * known.value / known.stddev) ** 2, ROUNDING, 1.0))
-        return replace(self, solution=_solved(self.solution, replace(problem, share=share * problem.share)))
+        return replace(self, solved=self.solved.solved(lambda problem: replace(problem, share=share * problem.share)))
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""
         linear, noise = problem.among(problem.is_used)
-        return Posterior.best(linear, noise, self.solution.fit.log_scale_stddev)
+        return Posterior.best(linear, noise, self.solved.log_scale_stddev)
 
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
         """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
         turns, shifts_m = bent.at(self.path.frame_ids)
         first_from_world = self.path.world_from_cam[0].T
         in_first = Rotation.from_rotvec(np.einsum("ij,kjl,kl->ki", first_from_world, self.path.world_from_cam, turns))
-        on_path, problem = self.posed.observations.on_path(self.posed.rows), self.solution.problem
-        shifts = self.unit * shifts_m @ first_from_world.T
-        carried = replace(self.solution, problem=problem.carried(on_path, in_first.as_matrix(), shifts))
-        return replace(self, solution=moved(carried, known))
+        posed = self.solved.posed.carried(in_first.as_matrix(), self.unit * shifts_m @ first_from_world.T)
+        return replace(self, solved=moved(replace(self.solved, posed=posed), known))
 
     def concluded(self, on_map: JointMap) -> RangeScale:
         """Return the ranges with what the whole map says of them."""
-        posed, solution, told = self.posed, self.solution, self.told
+        solved, posed, told = self.solved, self.solved.posed, self.told
         log, bins, noise = posed.observations.log, bins_on(on_map), on_map.problem.noise_of(RANGES)
         if on_map.is_at_rest:
             stddevs = noise.stddev_of_component
-            return replace(self, told=replace(told, noise_stddev_m=solution.noise_stddev_m, error_stddevs=stddevs))
-        known, after = on_map.posterior, self.moved(on_map.posterior)
+            return replace(self, told=replace(told, noise_stddev_m=solved.noise_stddev_m, error_stddevs=stddevs))
+        known, after = on_map.posterior, moved(solved, on_map.posterior)
         status = posed.observations.status.copy()
         status[posed.observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
-        status[posed.rows] = status_by_weight(solution.fit.weights)
+        status[posed.rows] = status_by_weight(solved.weights)
         found = RangeEstimate(
             replace(posed.observations, status=status),
-            solution.errors.spread(posed.rows, len(log)),
-            solution.noise_stddev_m,
+            solved.errors.spread(posed.rows, len(log)),
+            solved.noise_stddev_m,
             noise.stddev_of_component,
-            float(np.median(np.abs(solution.fit.residuals_m))),
-            anchor_estimates(after.solution, log.anchor_ids, known.covariance),
-            scale_per_anchor(solution, log.anchor_ids),
-            scale_sensitivity(after.solution, posed, on_map.problem.of_kind(RANGES, known.gains), bins),
-            _paper_table(solution),
+            float(np.median(np.abs(solved.fit_residual_m))),
+            anchor_estimates(after, known),
+            scale_per_anchor(solved),
+            scale_sensitivity(after, on_map.problem.of_kind(RANGES, known.gains), bins),
+            _paper_table(solved),
             np.zeros((len(log), 0)),
         )
         if any(each.is_used for each in on_map.kinds if each.kind != self.kind):
-            of_rows = shared_errors_m(solution, noise, bins)
+            of_rows = shared_errors_m(solved, noise, bins)
             shared_m = np.zeros((len(log), of_rows.shape[1]))
             shared_m[posed.rows] = of_rows
             found = replace(found, shared_errors_m=shared_m)
@@ -159,7 +154,7 @@ class RangeScale(KindOnMap):
 
     def _levelled(self, found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
         """Describe where gravity puts the first camera if the site's anchors do not fix the map's heading."""
-        given = self.posed.given
+        given = self.solved.posed.given
         if given.gravity is None or given.anchor_frame != "site" or self.places_map:
             return ()
         return levelled_places(given.gravity, given.anchors, found)
@@ -171,12 +166,11 @@ class RangeScale(KindOnMap):
 
     def on(self, on_map: JointMap) -> RangesOnMap:
         """Return the ranges for tests: where they are on a map at rest, or where they bend one that is only scaled."""
-        return ranges_on_map(self.posed, self.solution, self.bending) if on_map.is_at_rest else self._where_bent.on_map
+        return self.solved if on_map.is_at_rest else self._where_bent.on_map
 
     @cached_property
     def _where_bent(self) -> AnchorSides:
-        here = ranges_on_map(self.posed, self.solution, self.bending)
-        return likelier_sides(bent_to_ranges(here, self.solution.rivals))
+        return likelier_sides(bent_to_ranges(self.solved, self.solved.rivals))
 
     def sides(self, on_map: JointMap) -> Iterator[AnchorSides]:
         """Yield on which sides of the path the unknown anchors stand."""
@@ -197,45 +191,44 @@ class RangeScale(KindOnMap):
         problem = linearized(bent).with_learnt_errors()
         if not drifts(problem):
             return
-        weights, rows = problem.bins.robust_weight, self.posed.rows
+        weights, rows = problem.bins.robust_weight, self.solved.posed.rows
         known = Posterior.best(problem.linear, problem.noise, on_map.posterior.uncertainty.formal)
-        solution = replace(self.solution, fit=replace(self.solution.fit, state=bent.state, weights=weights))
+        solved = replace(self.solved, state=bent.state, weights=weights)
         status, stddev_m = told.observations.status.copy(), told.errors.stddev_m.copy()
         status[rows], stddev_m[rows] = status_by_weight(weights), problem.scatter_m
         places = zip(told.anchors, bent.state.anchors_m, strict=True)
         drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
-        remarks = (*remarks_on_anchors(solution, told.anchors), Doubt(drift))
+        remarks = (*remarks_on_anchors(solved, told.anchors), Doubt(drift))
         told = replace(
             told,
             observations=replace(told.observations, status=status),
             errors=replace(told.errors, stddev_m=stddev_m),
             anchors=tuple(replace(anchor, position_m=at_m) for anchor, at_m in places),
         )
-        placed = bent.state.metric_from_model @ self.posed.first_camera_from_sfm
-        doubts = tuple(doubts_of_ranges(self.posed, solution, known.uncertainty, {}))
+        placed = bent.state.metric_from_model @ first_camera_from(solved.posed.given.trajectory)
+        doubts = tuple(doubts_of_ranges(solved, known.uncertainty, {}))
         yield BentMap(replace(self, told=told), placed, known, doubts, remarks)
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> Diagnosis:
         """Return the tests of all mistakes that ranges can show."""
         del by_kind
-        return diagnose_ranges(self.on(on_map), seed=self.posed.given.seed)
+        return diagnose_ranges(self.on(on_map), seed=self.solved.posed.given.seed)
 
     @property
     def blocks(self) -> Mapping[Block, Array]:
         """Positions of the anchors."""
-        names = self.posed.observations.log.anchor_ids
-        return {("anchor", name): at for name, at in zip(names, self.solution.fit.state.anchors_m, strict=True)}
+        at_m = zip(self.solved.anchor_ids, self.solved.state.anchors_m, strict=True)
+        return {("anchor", name): position_m for name, position_m in at_m}
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield the faults of the path, of the anchors and of the ranges."""
-        return doubts_of_ranges(self.posed, self.solution, uncertainty, self.told.per_anchor)
+        return doubts_of_ranges(self.solved, uncertainty, self.told.per_anchor)
 
     def remarks(self, on_map: JointMap) -> Iterator[Doubt]:
         """Yield what is not determined, and that the anchors' coordinates widen the interval."""
-        yield from remarks_on_anchors(self.solution, self.told.anchors)
-        if self.posed.ranges.has_known_anchors:
-            posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
-            unknown = replace(self, posed=posed, solution=solution)
+        yield from remarks_on_anchors(self.solved, self.told.anchors)
+        if self.solved.problem.has_known_anchors:
+            unknown = replace(self, solved=with_unknown_anchors(self.solved))
             others = [unknown if each is self else each for each in on_map.kinds]
             unplaced = on_map.rejoined(others, unknown.start).posterior.uncertainty
             yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
@@ -248,19 +241,8 @@ def bins_on(on_map: JointMap) -> RangeBins:
     return observed.bins
 
 
-def _paper_table(solution: Solution) -> TwoCandidate | None:
+def _paper_table(on_map: RangesOnMap) -> TwoCandidate | None:
     """Return the paper's table, with the anchors carried into the first camera's frame."""
-    state, problem = solution.fit.state, solution.problem
-    placed = state.metric_from_model
-    anchors = (state.anchors_m - placed.translation) @ placed.rotation
+    problem, placed = on_map.problem, on_map.state.metric_from_model
+    anchors = (on_map.state.anchors_m - placed.translation) @ placed.rotation
     return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
-
-
-def _solved(solution: Solution, problem: RangeProblem) -> Solution:
-    """Return the solution of another problem of the same ranges, starting from this one."""
-    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
-
-
-def _ranges_alone(problem: RangeProblem) -> RangeProblem:
-    is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
-    return replace(problem.without_others(), frame_is_free=is_free)

@@ -16,13 +16,14 @@ from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
-from rangesfm.measurements.ranges.scale.solution import (
-    Solution,
-    solution_from,
-    solve_scale,
-    weighted,
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.scale_problem import (
+    RangesOnPath,
+    ScaleProblem,
+    scale_problem,
+    turns_and_velocities,
 )
+from rangesfm.measurements.ranges.scale.solution import solution_from, solve_scale
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
@@ -30,14 +31,9 @@ from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, mov
 
 @dataclass(frozen=True)
 class RangesToSolve(Located):
-    """Ranges on an unscaled path: where the map and its anchors are is found beside the other kinds.
-
-    Attributes:
-        given: the ranges. bending: of the map.
-    """
+    """Ranges on an unscaled path: where the map and its anchors are is found beside the other kinds."""
 
     given: RangesOnPath
-    bending: MapBending
 
     kind = RANGES
 
@@ -54,18 +50,17 @@ class RangesToSolve(Located):
         Raises:
             InputError: an anchor of the log is not given. GeometryError: the scale is not determined.
         """
-        problem, notes = self.posed(others), tuple[str, ...]()
-        solution = solve_scale(problem)
-        if solution.why_open:
-            notes = (f"the map gets metres, but no place in the site: {solution.why_open}",)
-            problem = self.posed(others, place_is_open=True)
-            solution = solution_from(problem, solution.fit.state.in_frame_of_model())
-        return self.solved(problem, solution, notes)
+        found = solve_scale(self.posed(others))
+        if not found.why_open:
+            return self.solved(found)
+        posed = self.posed(others, place_is_open=True)
+        note = f"the map gets metres, but no place in the site: {found.why_open}"
+        return self.solved(solution_from(posed, found.state.in_frame_of_model()), (note,))
 
-    def solved(self, problem: ScaleProblem, solution: Solution, notes: tuple[str, ...] = ()) -> RangeScale:
+    def solved(self, found: RangesOnMap, notes: tuple[str, ...] = ()) -> RangeScale:
         """Return the ranges at a solution of their problem."""
         told = RangeEstimate.begun(self.given.observations, self.given.range_model)
-        return RangeScale(problem, solution, self.given.trajectory, 1.0, self.bending, told, notes)
+        return RangeScale(found, self.given.trajectory, 1.0, told, notes)
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class RangesAtRest(Located):
 
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges where the map has them."""
-        path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.posed
+        path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.solved.posed
         unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
         placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
         tags_m, centers_m = ranges.antennas_m(self.state)
@@ -101,18 +96,21 @@ class RangesAtRest(Located):
             # The model's frame is that of the first camera, in the unit of the unscaled model.
             placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
         )
+        turns, velocity = turns_and_velocities(posed.observations, posed.rows, trajectory)
+        given = replace(posed.given, trajectory=trajectory, bending=self.bending)
+        posed = replace(posed, given=given, ranges=problem, model_from_cam=turns, velocity=velocity)
         anchors = anchors_at(ranges.anchors, self.state.blocks)
         state = RangeState(
             placed,
             np.array([anchor.position_m for anchor in anchors]),
             np.array([anchor.range_bias_m for anchor in anchors]),
         )
-        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
+        weighted, errors = posed.weighted(ranges.errors), ranges.errors
         off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
-        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
-        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
-        posed = replace(posed, ranges=problem, given=replace(posed.given, trajectory=trajectory))
-        return RangeScale(posed, solution, path, unit, self.bending, self.before.told, self.before.notes)
+        fit, noise_m = fit_at(weighted, state, errors.robust_weights(off_m)), float(np.median(errors.stddev_m))
+        return RangeScale(
+            RangesOnMap.at(posed, weighted, fit, errors, noise_m), path, unit, self.before.told, self.before.notes
+        )
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:

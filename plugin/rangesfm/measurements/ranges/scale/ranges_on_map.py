@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,48 +13,83 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.errors.components import PLACES, OtherError
 from rangesfm.measurements.ranges.errors.learned import radio_components
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, range_bins
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeFit,
     RangeProblem,
     RangeState,
     antenna_positions,
     columns_of,
+    fit_at,
+    predicted_ranges,
     prior_jacobian,
     prior_residuals,
     range_jacobian,
+    solve,
 )
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component
-from rangesfm.util.geometry.trajectory import OnPath
 
 
 @dataclass(frozen=True)
 class RangesOnMap:
-    """n ranges that took part in an estimate, and its state.
+    """n ranges at a state of a map.
 
     Attributes:
-        posed: their scale problem.
-        problem: its ranges, corrected where a mistake is undone, with standard deviations of 1: its residuals and
-            Jacobians are in metres.
-        state: the estimate.
-        model_from_cam: (n, 3, 3) rotations into the model's world.
-        velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
+        posed: their scale problem; corrected where a mistake is undone, and carried along where the map is bent.
+        weighted: the problem that was solved; its priors are scaled for ranges with independent errors.
+        state: of the map and the anchors.
         time_s: (n,) as ``ScaleProblem.times_s``.
-        weights: (n,) robust weights in the estimate.
+        weights: (n,) robust weights in the solution; larger than 1 for a range that stands for several.
+        errors: of the ranges, as weighted in the solution, whose formal standard deviations their inflation multiplies.
+        noise_stddev_m: standard deviation of an ordinary range, estimated from the solution.
         bending: of the map.
+        rivals: states of other maps that fit worse, the likeliest first.
+        why_open: why the map also fits in another place of the site, with the same scale; empty if it does not.
     """
 
     posed: ScaleProblem
-    problem: RangeProblem
+    weighted: RangeProblem
     state: RangeState
-    model_from_cam: Array
-    velocity: Array | None
     time_s: Array
     weights: Array
+    errors: RangeErrors
+    noise_stddev_m: float
     bending: MapBending
+    rivals: tuple[RangeState, ...] = ()
+    why_open: str = ""
+
+    @property
+    def problem(self) -> RangeProblem:
+        """Of ``posed``, whose standard deviations are from before anything was estimated."""
+        return self.posed.ranges
+
+    @property
+    def log_scale_stddev(self) -> float:
+        """Formal standard deviation of the logarithm of the scale."""
+        return fit_at(self.weighted, self.state, self.weights).log_scale_stddev
+
+    @classmethod
+    def at(
+        cls, posed: ScaleProblem, weighted: RangeProblem, fit: RangeFit, errors: RangeErrors, noise_m: float
+    ) -> RangesOnMap:
+        """Return the ranges at a fit of their weighted problem."""
+        times_s = posed.times_s(fit.state.metric_from_model.scale)
+        return cls(posed, weighted, fit.state, times_s, fit.weights, errors, noise_m, posed.given.bending)
+
+    def solved(self, change: Callable[[RangeProblem], RangeProblem]) -> RangesOnMap:
+        """Return the ranges at the solution of a problem that was changed, near their state, with the same errors."""
+        posed, weighted = replace(self.posed, ranges=change(self.posed.ranges)), change(self.weighted)
+        fit = solve(weighted, self.state, loss=self.errors.loss)
+        found = RangesOnMap.at(posed, weighted, fit, self.errors, self.noise_stddev_m)
+        return replace(found, rivals=self.rivals, why_open=self.why_open)
+
+    def with_problem(self, problem: RangeProblem) -> RangesOnMap:
+        """Return the ranges with another problem of them, at the same state."""
+        return replace(self, posed=replace(self.posed, ranges=problem))
 
     @property
     def anchor_ids(self) -> tuple[str, ...]:
@@ -69,15 +104,15 @@ class RangesOnMap:
         return self.posed.observations.log.tag_index[self.posed.rows]
 
     @property
-    def on_path(self) -> OnPath:
-        """Places of the ranges between keyframes."""
-        return self.posed.observations.on_path(self.posed.rows)
-
-    @property
     def world_from_cam(self) -> Array:
         """(n, 3, 3) rotations of the cameras into the metric world."""
-        turned: Array = self.state.metric_from_model.rotation @ self.model_from_cam
+        turned: Array = self.state.metric_from_model.rotation @ self.posed.model_from_cam
         return turned
+
+    @property
+    def fit_residual_m(self) -> Array:
+        """(n,) predicted minus measured range, metres, with the estimated biases."""
+        return predicted_ranges(self.problem, self.state) - self.problem.range_m
 
     @property
     def residual_m(self) -> Array:
@@ -99,16 +134,16 @@ class RangesOnMap:
     @property
     def by_time(self) -> Array:
         """(n,) derivatives by the clocks' offset, metres per second; 0 where ranges have no times."""
-        if self.velocity is None:
+        if self.posed.velocity is None:
             return np.zeros(len(self.time_s))
         placed = self.state.metric_from_model
-        return self.gradient.by_log_scale(placed.scale * self.velocity @ placed.rotation.T)
+        return self.gradient.by_log_scale(placed.scale * self.posed.velocity @ placed.rotation.T)
 
     @property
     def by_poses(self) -> csr_array:
         """(n, 6 k) derivatives by the path's k poses: turns in their own frames, shifts in the model's world."""
         placed, arms_m = self.state.metric_from_model, self.problem.tag_from_center
-        return by_poses(self.gradient, placed, self.model_from_cam, arms_m, self.on_path)
+        return by_poses(self.gradient, placed, self.posed.model_from_cam, arms_m, self.posed.on_path)
 
     def bins(self, weights: Array, noise_of_anchor: Array, max_num: int) -> RangeBins:
         """Average the ranges, as ``range_bins``."""
@@ -125,7 +160,8 @@ class RangesOnMap:
 
     def linearized(self, bins: RangeBins) -> LinearMap:
         """Linearise about the state: the biases of anchors are errors of the bins here, and no unknowns."""
-        problem = replace(self.problem, bias_stddev_m=np.zeros(self.problem.num_anchors))
+        in_metres, no_biases = np.ones(len(self.time_s)), np.zeros(self.problem.num_anchors)
+        problem = replace(self.problem, stddev_m=in_metres, bias_stddev_m=no_biases)
         columns, state = columns_of([problem])[0], self.state
         return LinearMap(
             residual_m=bins.mean(self.residual_m),
@@ -143,21 +179,7 @@ class RangesOnMap:
         """
         placing_m, known_m2 = self.posed.placing_stddev_m(self.state.metric_from_model.scale), dict[OtherError, Array]()
         if np.any(placing_m > 0):
-            known_m2[PLACES] = bins.shared_by_places(self.gradient.by_tag, placing_m, self.on_path.before)
+            known_m2[PLACES] = bins.shared_by_places(self.gradient.by_tag, placing_m, self.posed.on_path.before)
         stddevs = {"bias": float(self.problem.bias_stddev_m.max()), "common_bias": self.problem.common_bias_stddev_m}
         ruled_out = [name for name, stddev in stddevs.items() if stddev == 0]
         return radio_components(bins, self.posed.curve_stddev_m, ruled_out, known_m2 | {**others_m2})
-
-
-def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending) -> RangesOnMap:
-    """Collect the ranges of a problem at its solution."""
-    return RangesOnMap(
-        posed=posed,
-        problem=replace(posed.ranges, stddev_m=np.ones(len(posed.rows)), share=np.ones(len(posed.rows))),
-        state=solution.fit.state,
-        model_from_cam=posed.model_from_cam,
-        velocity=posed.velocity,
-        time_s=posed.times_s(solution.fit.state.metric_from_model.scale),
-        weights=solution.fit.weights,
-        bending=bending,
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,10 +22,11 @@ from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_stee
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
 from rangesfm.options import RangeModelOptions
+from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
-from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
-from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory, first_camera_from
+from rangesfm.util.geometry.similarity import path_shape, rounding_of
+from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory
 
 MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
@@ -37,7 +38,7 @@ class RangesOnPath:
 
     Attributes:
         observations: all ranges of the log.
-        trajectory: path of the unscaled model.
+        trajectory: path of the unscaled model. bending: of the map.
         anchors: every anchor of the log, with its prior knowledge, in the order of their file.
         anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
             keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
@@ -52,6 +53,7 @@ class RangesOnPath:
 
     observations: RangeObservations
     trajectory: Trajectory
+    bending: MapBending
     anchors: Sequence[Anchor]
     anchor_frame: str
     range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
@@ -69,6 +71,9 @@ class ScaleProblem:
     Attributes:
         given: the ranges on the path.
         ranges: the problem; its model world is the first camera's frame, unscaled.
+        model_from_cam: (k, 3, 3) rotations of the keyframe nearest to each range.
+        velocity: (k, 3) camera velocity at each range, model units per second. None without times, or if the photos'
+            times do not increase along the path.
         errors: prior errors of its ranges, before anything is estimated.
         rows: (k,) rows of the observations that its ranges are.
         notes: why the map has no place in the site frame, for the user.
@@ -77,6 +82,8 @@ class ScaleProblem:
 
     given: RangesOnPath
     ranges: RangeProblem
+    model_from_cam: Array
+    velocity: Array | None
     errors: RangeErrors
     rows: Indices
     notes: tuple[str, ...]
@@ -88,58 +95,14 @@ class ScaleProblem:
         return self.given.observations
 
     @property
-    def trajectory(self) -> Trajectory:
-        """Path of the unscaled model."""
-        return self.given.trajectory
-
-    @property
-    def frame(self) -> str:
-        """Metric world of the solution: "site" or "first_camera"."""
-        return "site" if self.ranges.frame_is_free else "first_camera"
-
-    @property
-    def order_given(self) -> tuple[str, ...]:
-        """Ids of the anchors in the order of their file."""
-        return tuple(anchor.anchor_id for anchor in self.given.anchors)
-
-    @property
-    def site(self) -> Site:
-        """Frame of the anchors' positions."""
-        return self.given.site
-
-    @property
-    def first_camera_from_sfm(self) -> Similarity:
-        """Rigid motion from the world of the unscaled model to the model world of the ranges."""
-        return first_camera_from(self.trajectory)
-
-    @property
-    def model_from_cam(self) -> Array:
-        """(k, 3, 3) rotations of the keyframe nearest to each range."""
-        turned: Array = self.trajectory.world_from_cam[0].T @ self.trajectory.world_from_cam[self._nearest]
-        return turned
-
-    @property
-    def velocity(self) -> Array | None:
-        """(k, 3) camera velocity at each range, model units per second.
-
-        None without times, or if the photos' times do not increase along the path.
-        """
-        times = self.trajectory.timestamps_s
-        # Two photos at once, or a path that goes back in time, have no velocity.
-        is_by_photo = isinstance(self.observations.log.moments, ByPhoto)
-        if is_by_photo or times is None or len(times) < 2 or (np.diff(times) <= 0).any():
-            return None
-        velocities = np.gradient(self.trajectory.centers, times, axis=0)[self._nearest]
-        return np.asarray(velocities @ self.trajectory.world_from_cam[0])
+    def on_path(self) -> OnPath:
+        """Places of the ranges between keyframes."""
+        return self.observations.on_path(self.rows)
 
     @property
     def curve_stddev_m(self) -> Array:
         """(k,) standard deviations of a learnt error curve that was subtracted from the ranges; NaN if none was."""
         return self.observations.log.shared_stddev_m[self.rows]
-
-    @property
-    def _nearest(self) -> Indices:
-        return self.observations.nearest[self.rows]
 
     def times_s(self, metres_per_unit: float) -> Array:
         """Return (k,) times of the ranges in seconds; where the log names photos, as of somebody who walks."""
@@ -152,6 +115,37 @@ class ScaleProblem:
     def placing_stddev_m(self, metres_per_unit: float) -> Array:
         """Return the (k,) standard deviation of each coordinate of the antennas, metres, in a map of this scale."""
         return self.observations.placing_stddev_m(metres_per_unit)[self.rows]
+
+    def carried(self, turns: Array, shifts: Array) -> ScaleProblem:
+        """Return them on the path bent by turns (k, 3, 3) and shifts (k, 3) of its keyframes, in the model's world."""
+        at, share = self.on_path, self.on_path.fraction[:, None]
+        turn = turns[at.nearest]
+        ranges = replace(
+            self.ranges,
+            centers=self.ranges.centers + (1 - share) * shifts[at.before] + share * shifts[at.after],
+            tag_from_center=np.einsum("nij,nj->ni", turn, self.ranges.tag_from_center),
+        )
+        velocity = None if self.velocity is None else np.einsum("nij,nj->ni", turn, self.velocity)
+        return replace(self, ranges=ranges, model_from_cam=turn @ self.model_from_cam, velocity=velocity)
+
+    def weighted(self, errors: RangeErrors) -> RangeProblem:
+        """Return the problem weighted by errors.
+
+        Correlated ranges carry less information than independent ones. The ranges keep their nominal weights, and the
+        priors get more weight instead, by the square of the inflation.
+        """
+        ranges, inflation = self.ranges, errors.inflation
+        distances, gravity, placement = ranges.distances, ranges.gravity, ranges.placement
+        return replace(
+            ranges,
+            stddev_m=errors.stddev_m,
+            share=errors.share,
+            bias_stddev_m=ranges.bias_stddev_m / inflation,
+            common_bias_stddev_m=ranges.common_bias_stddev_m / inflation,
+            distances=replace(distances, stddev_m=distances.stddev_m / inflation),
+            gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
+            placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
+        )
 
 
 def scale_problem(
@@ -211,7 +205,25 @@ def scale_problem(
         gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,
     )
-    return ScaleProblem(given, ranges, errors, rows, tuple(notes), left_out)
+    turns, velocity = turns_and_velocities(observations, rows, given.trajectory)
+    return ScaleProblem(given, ranges, turns, velocity, errors, rows, tuple(notes), left_out)
+
+
+def turns_and_velocities(
+    observations: RangeObservations, rows: Indices, trajectory: Trajectory
+) -> tuple[Array, Array | None]:
+    """Return ``model_from_cam`` and ``velocity`` of a ScaleProblem on a path."""
+    nearest, times_s, world_from_first = (
+        observations.nearest[rows],
+        trajectory.timestamps_s,
+        trajectory.world_from_cam[0],
+    )
+    turns: Array = world_from_first.T @ trajectory.world_from_cam[nearest]
+    # Two photos at once, or a path that goes back in time, have no velocity.
+    is_by_photo = isinstance(observations.log.moments, ByPhoto)
+    if is_by_photo or times_s is None or len(times_s) < 2 or (np.diff(times_s) <= 0).any():
+        return turns, None
+    return turns, np.asarray(np.gradient(trajectory.centers, times_s, axis=0)[nearest] @ world_from_first)
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:

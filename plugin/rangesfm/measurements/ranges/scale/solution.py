@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,11 +20,13 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
     RangeState,
     antenna_positions,
+    cost_at,
     predicted_ranges,
     prior_cost,
     range_gradient,
     solve,
 )
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.starts import (
     complete_unknown_anchors,
@@ -67,28 +69,7 @@ WHY_SCALE_IS_OPEN = {
 """Reasons why another scale fits as well, and what to do about it, by the kind of path."""
 
 
-@dataclass(frozen=True)
-class Solution:
-    """A fit weighted by the noise level that it shows itself.
-
-    Attributes:
-        problem: with the final standard deviations; its priors are scaled for ranges with independent errors.
-        fit: the estimate.
-        errors: of the problem's ranges; every formal standard deviation must be multiplied by their inflation.
-        noise_stddev_m: standard deviation of an ordinary range, estimated from the fit.
-        rivals: states of other maps that fit worse, the likeliest first.
-        why_open: why the map also fits in another place of the site, with the same scale; empty if it does not.
-    """
-
-    problem: RangeProblem
-    fit: RangeFit
-    errors: RangeErrors
-    noise_stddev_m: float
-    rivals: tuple[RangeState, ...] = ()
-    why_open: str = ""
-
-
-def solve_scale(posed: ScaleProblem) -> Solution:
+def solve_scale(posed: ScaleProblem) -> RangesOnMap:
     """Solve from all starts, estimate the noise, and refuse if two different maps fit equally well.
 
     Raises:
@@ -99,19 +80,19 @@ def solve_scale(posed: ScaleProblem) -> Solution:
         start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
         return solution_from(posed, complete_unknown_anchors(problem, start))
     camera_side = posed.given.camera_side if problem.frame_is_free else None
-    fits = on_side(problem, _distinct_fits(problem, posed.given.seed), camera_side)
-    starts = [fit.state for fit in fits]
+    starts = on_side(problem, [fit.state for fit in _distinct_fits(problem, posed.given.seed)], camera_side)
     if problem.has_known_anchors and not problem.frame_is_free:
         starts += _consensus_states(problem)
     starts.sort(key=lambda state: _unlikeliness(problem, errors, state))
     likeliest = each_once(starts, lambda *both: _are_same(problem, *both), _NUM_ALTERNATIVES)
-    solutions = [solution_from(posed, start) for start in likeliest]
-    solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
-    on_side(problem, [solutions[0].fit], camera_side)
-    others = [solution.fit.state for solution in solutions[1:]]
-    why_open = refuse_ambiguity(solutions[0], others, camera_side)
-    rivals = tuple(each for each in others if is_on_side(problem, each, camera_side))
-    return replace(solutions[0], rivals=rivals, why_open=why_open)
+    best, *others = sorted(
+        (solution_from(posed, start) for start in likeliest),
+        key=lambda each: _unlikeliness(problem, errors, each.state),
+    )
+    on_side(problem, [best.state], camera_side)
+    why_open = refuse_ambiguity(best, [each.state for each in others], camera_side)
+    rivals = tuple(each.state for each in others if is_on_side(problem, each.state, camera_side))
+    return replace(best, rivals=rivals, why_open=why_open)
 
 
 def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
@@ -186,7 +167,7 @@ def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> b
     return not (turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
 
 
-def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
+def solution_from(posed: ScaleProblem, start: RangeState) -> RangesOnMap:
     """Alternate between fitting and estimating the errors, from one start; the last fit uses all ranges."""
     given = posed.ranges
     rows = spread_rows(given, ENOUGH_TO_JUDGE)
@@ -202,55 +183,36 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
         errors = replace(errors, shared_m=shared_stddev(distance_m, posed.curve_stddev_m))
         return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
 
-    def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:
-        return seen(errors.inflated(residuals_m(fitted.state)), fitted.state)
+    def shown(errors: RangeErrors, state: RangeState) -> RangeErrors:
+        return seen(errors.inflated(residuals_m(state)), state)
 
     state, used = start, seen(posed.errors, start)
     for _ in range(_NUM_ROUNDS):
-        rough = solve(weighted(given, used).by_some(rows), state, loss=used.loss)
-        state, used = rough.state, shown(used, rough)
+        state = solve(posed.weighted(used).by_some(rows), state, loss=used.loss).state
+        used = shown(used, state)
     for _ in range(MAX_NUM_ROUNDS):
-        problem = weighted(given, used)
-        fitted = solve(problem, state, loss=used.loss)
-        last = shown(used, fitted)
+        weighted = posed.weighted(used)
+        fit = solve(weighted, state, loss=used.loss)
+        last = shown(used, fit.state)
         # The first rounds may have taken garbage for noise, which the last fit does not any more.
         if last.noise_m > _FALLS * used.noise_m:
             break
-        used, state = last, fitted.state
-    return Solution(problem, fitted, replace(used, inflation=last.inflation), last.noise_m)
+        used, state = last, fit.state
+    return RangesOnMap.at(posed, weighted, fit, replace(used, inflation=last.inflation), last.noise_m)
 
 
-def with_unknown_anchors(posed: ScaleProblem, start: RangeState) -> tuple[ScaleProblem, Solution]:
-    """Return the problem as it would be if no place of an anchor were known, and its solution from a start.
+def with_unknown_anchors(on_map: RangesOnMap) -> RangesOnMap:
+    """Return the ranges at the solution that they would have if no place of an anchor were known.
 
     The map then stays in a frame of its own, unless known positions place it.
     """
-    unknown, is_placed = np.full(posed.ranges.num_anchors, np.inf), posed.ranges.placement is not None
-    posed = replace(posed, ranges=replace(posed.ranges, anchor_stddev_m=unknown, frame_is_free=is_placed))
-    return posed, solution_from(posed, start)
+    problem = on_map.problem
+    unknown, is_placed = np.full(problem.num_anchors, np.inf), problem.placement is not None
+    unplaced = on_map.with_problem(replace(problem, anchor_stddev_m=unknown, frame_is_free=is_placed))
+    return solution_from(unplaced.posed, on_map.state)
 
 
-def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
-    """Return the problem weighted by the errors.
-
-    Correlated ranges carry less information than independent ones. The ranges keep their nominal weights, and the
-    priors get more weight instead, by the square of the inflation.
-    """
-    distances, gravity, inflation = problem.distances, problem.gravity, errors.inflation
-    placement = problem.placement
-    return replace(
-        problem,
-        stddev_m=errors.stddev_m,
-        share=errors.share,
-        bias_stddev_m=problem.bias_stddev_m / inflation,
-        common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
-        distances=replace(distances, stddev_m=distances.stddev_m / inflation),
-        gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
-        placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
-    )
-
-
-def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> str:
+def refuse_ambiguity(best: RangesOnMap, rivals: Sequence[RangeState], camera_side: str | None) -> str:
     """Raise GeometryError if the map of a rival of another scale fits as well.
 
     Where even the best map explains too few ranges, that is the reason to doubt it, and no rival is looked at.
@@ -258,19 +220,18 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
     Returns:
         why the map of a rival of the same scale fits as well; empty if none does.
     """
-    problem = solution.problem
-    if np.mean(solution.fit.weights < OUTLIER_BELOW) > MANY_OUTLIERS:
+    problem, loss = best.weighted, best.errors.loss
+    if np.mean(best.weights < OUTLIER_BELOW) > MANY_OUTLIERS:
         return ""
     for rival in rivals:
-        other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
-        is_elsewhere = not is_on_side(problem, other.state, camera_side)
-        if is_elsewhere or _are_same(problem, other.state, solution.fit.state):
+        other = solve(problem, rival, loss=loss, tolerance=1e-8)
+        if not is_on_side(problem, other.state, camera_side) or _are_same(problem, other.state, best.state):
             continue
-        gap = (other.cost - solution.fit.cost) / solution.errors.inflation**2
+        gap = (other.cost - cost_at(problem, best.state, loss)) / best.errors.inflation**2
         if gap < MIN_COST_GAP:
-            ours, theirs = solution.fit.state.metric_from_model.scale, other.state.metric_from_model.scale
-            extent = float(np.linalg.norm(path_shape(solution.problem.centers).stddevs))
-            if min(ours, theirs) * extent < solution.noise_stddev_m:
+            ours, theirs = best.state.metric_from_model.scale, other.state.metric_from_model.scale
+            extent = float(np.linalg.norm(path_shape(problem.centers).stddevs))
+            if min(ours, theirs) * extent < best.noise_stddev_m:
                 raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
             if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
                 return _another_place(problem)
