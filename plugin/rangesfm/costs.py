@@ -6,10 +6,7 @@ installed pyceres (``rangesfm doctor`` says why).
 """
 
 from rangesfm.solver import (
-    PlacedRanges,
-    RangeBlocks,
     add_normal_prior,
-    add_ranges,
     add_residual_block,
     direction_cost,
     distance_cost,
@@ -22,10 +19,7 @@ from rangesfm.solver import (
 )
 
 __all__ = [
-    "PlacedRanges",
-    "RangeBlocks",
     "add_normal_prior",
-    "add_ranges",
     "add_residual_block",
     "direction_cost",
     "distance_cost",

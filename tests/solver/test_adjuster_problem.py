@@ -262,15 +262,6 @@ LIFETIMES = """
             residuals.append((cost, loss, blocks))
             point = next(iter(reconstruction.points3D.values())).xyz
             solver.keep_from_elimination(adjuster, blocks[1], point)
-        poses = [reconstruction.frame(frame_id).rig_from_world.params for frame_id in reconstruction.reg_frame_ids()]
-        rows = np.arange(4)
-        ranges = solver.PlacedRanges(
-            range_m=np.ones(4), stddev_m=np.ones(4), before=rows % 2, after=rows % 2 + rows // 2, weight=rows / 4,
-            offset_in_world_m=np.zeros((4, 3)), anchor_index=0 * rows, tag_index=0 * rows,
-        )
-        many = solver.RangeBlocks(poses, [np.ones(3)], [np.zeros(1)], [np.zeros(3)], lever_arms_are_free=True)
-        solver.add_ranges(adjuster, ranges, many, loss_scale=1.0)
-        residuals.append((ranges, many))
         return dict(adjuster=adjuster, problem=adjuster.problem, reconstruction=reconstruction, residuals=residuals)
 
     for order in itertools.permutations(("adjuster", "problem", "reconstruction", "residuals")):

@@ -14,13 +14,18 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.solver.test_covariance import ANCHORS_M, RANGE_STDDEV_M, TAG_IN_CAM_M, bundle_adjuster, model
+from tests.solver.test_covariance import (
+    ANCHORS_M,
+    RANGE_STDDEV_M,
+    TAG_IN_CAM_M,
+    Joint,
+    add_ranges,
+    bundle_adjuster,
+    model,
+)
 
 from rangesfm.solver import (
-    PlacedRanges,
-    RangeBlocks,
     add_normal_prior,
-    add_ranges,
     add_residual_block,
     distance_cost,
     keep_from_elimination,
@@ -88,18 +93,8 @@ def by_ceres(measured: Measured) -> tuple[Array, Array, MapErrors]:
     num_reprojections = problem.num_residuals()
     poses = [pose_of(reconstruction.frame(i)).params for i in sorted(reconstruction.reg_frame_ids())]
     anchors, no_bias = list(measured.given_anchors_m.copy()), [np.zeros(1) for _ in ANCHORS_M]
-    frame, anchor = (index.ravel() for index in np.indices(measured.range_m.shape))
-    ranges = PlacedRanges(
-        range_m=measured.range_m.ravel(),
-        stddev_m=np.full(len(frame), RANGE_STDDEV_M),
-        before=frame,
-        after=frame,
-        weight=np.zeros(len(frame)),
-        offset_in_world_m=np.zeros((len(frame), 3)),
-        anchor_index=anchor,
-        tag_index=np.zeros(len(frame), dtype=np.int64),
-    )
-    add_ranges(adjuster, ranges, RangeBlocks(poses, anchors, no_bias, [TAG_IN_CAM_M]))
+    survey = Joint(reconstruction, adjuster, anchors, no_bias, num_reprojections)
+    add_ranges(survey, measured.range_m.T)
     for block, given in zip(anchors, measured.given_anchors_m, strict=True):
         add_normal_prior(adjuster, block, mean=given, stddev=ANCHOR_STDDEV_M)
     for block in no_bias:

@@ -16,10 +16,7 @@ from tests.simulated.path import look_at, orbit_path
 
 from rangesfm.errors import GeometryError
 from rangesfm.solver import (
-    PlacedRanges,
-    RangeBlocks,
     add_normal_prior,
-    add_ranges,
     add_residual_block,
     distance_cost,
     keep_from_elimination,
@@ -144,27 +141,24 @@ def joint(
     adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
     anchors, biases = list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M]
     survey = Joint(reconstruction, adjuster, anchors, biases, adjuster.problem.num_residuals())
-    frame, anchor = (index.ravel() for index in np.meshgrid(np.arange(len(survey.poses)), np.arange(num_anchors)))
     path = orbit_path(1.4 * len(survey.poses))
     times = np.arange(len(survey.poses), dtype=np.float64)
     tags = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
-    distances = np.linalg.norm(tags[frame] - ANCHORS_M[anchor], axis=1)
-    ranges = PlacedRanges(
-        range_m=distances + (0.0 if range_errors_m is None else range_errors_m[anchor, frame]),
-        stddev_m=np.full(len(frame), RANGE_STDDEV_M),
-        before=frame,
-        after=frame,
-        weight=np.zeros(len(frame)),
-        offset_in_world_m=np.zeros((len(frame), 3)),
-        anchor_index=anchor,
-        tag_index=np.zeros(len(frame), dtype=np.int64),
-    )
-    add_ranges(adjuster, ranges, RangeBlocks(survey.poses, survey.anchors, survey.biases, [TAG_IN_CAM_M]))
+    range_m = np.linalg.norm(tags - ANCHORS_M[:num_anchors, None], axis=2)
+    add_ranges(survey, range_m + (0.0 if range_errors_m is None else range_errors_m))
     for position, bias in zip(survey.anchors, survey.biases, strict=False):
         add_normal_prior(adjuster, bias, mean=[0.0], stddev=BIAS_STDDEV_M)
         if hold_anchors:
             survey.problem.set_parameter_block_constant(position)
     return survey
+
+
+def add_ranges(survey: Joint, range_m: Array) -> None:
+    """Add (num_anchors, num_frames) ranges from the frames to the anchors."""
+    for anchor, bias, to_anchor_m in zip(survey.anchors, survey.biases, range_m.tolist(), strict=False):
+        for pose, of_frame_m in zip(survey.poses, to_anchor_m, strict=True):
+            cost = range_cost(range_m=of_frame_m, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=RANGE_STDDEV_M)
+            add_residual_block(survey.adjuster, cost, None, [pose, anchor, bias])
 
 
 def covariance_of_all(problem: Any, blocks: Sequence[Array]) -> Array:

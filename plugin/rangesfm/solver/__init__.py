@@ -8,9 +8,9 @@ A range residual goes into the problem of one of pycolmap's bundle adjusters::
     add_residual_block(adjuster, cost, None, [pose, anchor_in_world, range_bias])
     adjuster.solve()
 
-``add_ranges`` adds a whole log of ranges in one call. Poses are COLMAP's parameter blocks: rig_from_world as
-[qx qy qz qw tx ty tz]. "cam" is the rig frame (the frame of the rig's reference camera). Units are metres, residuals
-are in standard deviations, and every value is checked when a cost is created.
+Poses are COLMAP's parameter blocks: rig_from_world as [qx qy qz qw tx ty tz]. "cam" is the rig frame (the frame of the
+rig's reference camera). Units are metres, residuals are in standard deviations, and every value is checked when a cost
+is created.
 
 pycolmap, pyceres and the compiled part exchange C++ objects, which only works between the versions pinned in
 ``pyproject.toml``. The first use of anything here checks this, with a residual whose cost is known.
@@ -19,12 +19,8 @@ pycolmap, pyceres and the compiled part exchange C++ objects, which only works b
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.solver.adjuster_problem import (
-    MAX_NUM_SHARED,
-    PlacedRanges,
-    RangeBlocks,
     Step,
     add_normal_prior,
-    add_ranges,
     add_residual_block,
     keep_from_elimination,
     num_columns,
@@ -45,12 +41,8 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "MAX_NUM_SHARED",
-    "PlacedRanges",
-    "RangeBlocks",
     "Step",
     "add_normal_prior",
-    "add_ranges",
     "add_residual_block",
     "check_compatibility",
     "direction_cost",

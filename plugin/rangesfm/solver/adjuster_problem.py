@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csc_array, csr_array
 
-from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.arrays import Array
 from rangesfm.solver.installation_checks import check_compatibility
 from rangesfm.util.processes.threads import num_threads
 
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
-MAX_NUM_SHARED = _NUM_POSE_COLUMNS
-"""Largest size of a block of numbers that all ranges share: as many as a pose has columns."""
 # Objects that residuals refer to. The problem refers to its adjuster, so only a weak key lets both be freed in the end.
 _used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
 
@@ -38,9 +35,8 @@ def add_residual_block(
 
     ``adjuster.problem.add_residual_block`` has two traps. There, cost, loss and blocks live only as long as the Python
     object ``problem``, and solving without it reads freed memory; here they live as long as the adjuster. And a pose
-    that
-    the adjuster holds constant is part of its reprojection costs, not of the problem: there, a range would add it as a
-    free block without a manifold, which then moves on its own; here it is held constant, as is the pose of a frame
+    that the adjuster holds constant is part of its reprojection costs, not of the problem: there, a range would add it
+    as a free block without a manifold, which then moves on its own; here it is held constant, as is the pose of a frame
     without observations.
 
     Args:
@@ -121,149 +117,6 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
         manifold = _cpp.padded_manifold(size=len(block), tangent_size=_NUM_POSE_COLUMNS)
         adjuster.problem.set_manifold(block, manifold)
         _used_by_adjuster[adjuster].append(manifold)
-
-
-@dataclass(frozen=True)
-class PlacedRanges:
-    """n ranges, each at one keyframe (``before == after``) or between two.
-
-    Attributes:
-        range_m: (n,) measured ranges, positive.
-        stddev_m: (n,) standard deviation of the noise, positive.
-        before, after: (n,) indices of keyframes in ``RangeBlocks.poses``.
-        weight: (n,) interpolation fraction from 0 (at ``before``) to 1 (at ``after``).
-        offset_in_world_m: (n, 3) difference of a curved path from the straight line.
-        anchor_index: (n,) indices in ``RangeBlocks.anchors``.
-        tag_index: (n,) indices in ``RangeBlocks.tags_in_cam``.
-        interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
-        share: (n,) weight besides the noise, positive; None: 1.
-        loadings_m: (n, k) change of each range by each number of ``RangeBlocks.shared``; None: there are none.
-    """
-
-    range_m: Array
-    stddev_m: Array
-    before: Indices
-    after: Indices
-    weight: Array
-    offset_in_world_m: Array
-    anchor_index: Indices
-    tag_index: Indices
-    interval_s: Array | None = None
-    share: Array | None = None
-    loadings_m: Array | None = None
-
-
-@dataclass(frozen=True)
-class RangeBlocks:
-    """The parameter blocks of ranges; the solver changes them in place.
-
-    Attributes:
-        poses: rig_from_world (7,) of each keyframe.
-        anchors: (3,) position of each anchor in the world.
-        biases: (1,) of each anchor, by which its ranges are too long.
-        tags_in_cam: (3,) antenna of each tag in the rig frame; parameter blocks only if ``lever_arms_are_free``.
-        lever_arms_are_free: whether the tags' lever arms are estimated.
-        time_shift: (1,) seconds by which the ranges were taken later than assumed; None: not estimated. It affects
-            ranges between two keyframes, also those with a weight of 0 or 1.
-        amplitude: (1,) excess of short ranges at distance 0; given exactly if ``short_range_length_m`` is.
-        shared: numbers that all ranges share, together as many as ``PlacedRanges.loadings_m`` has columns, in blocks of
-            at most ``MAX_NUM_SHARED``.
-    """
-
-    poses: Sequence[Array]
-    anchors: Sequence[Array]
-    biases: Sequence[Array]
-    tags_in_cam: Sequence[Array]
-    lever_arms_are_free: bool = False
-    time_shift: Array | None = None
-    amplitude: Array | None = None
-    shared: Sequence[Array] = ()
-
-
-def add_ranges(
-    adjuster: pycolmap.CeresBundleAdjuster,
-    ranges: PlacedRanges,
-    blocks: RangeBlocks,
-    *,
-    short_range_length_m: float | None = None,
-    loss_scale: float = math.inf,
-    loss_is_bounded: bool = False,
-) -> Indices:
-    """Add ranges to a bundle adjuster's problem; ranges of one place, anchor and tag form one residual block.
-
-    The solver's work grows with the number of blocks and of pairs of blocks that share a residual, and much less with
-    the number of residuals in a block. Adding a block takes some microseconds. A robust loss acts on each range
-    separately.
-
-    Args:
-        adjuster: as in ``add_residual_block``, which describes lifetimes and constant poses.
-        ranges: n, in any order.
-        blocks: those without any range do not become part of the problem.
-        short_range_length_m, loss_scale, loss_is_bounded: as in ``range_cost``.
-
-    Returns:
-        (n,) index of each range's residual among the problem's.
-
-    Raises:
-        ValueError: as in ``range_cost`` and ``add_residual_block``; or a time shift is given without intervals, or only
-            one of amplitude and ``short_range_length_m``.
-        SolverError: see ``check_compatibility``.
-    """
-    if (blocks.amplitude is None) != (short_range_length_m is None):
-        raise ValueError("of short_range_length_m and its amplitude one is given without the other")
-    if blocks.time_shift is not None and ranges.interval_s is None:
-        raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
-    check_compatibility()
-    first = adjuster.problem.num_residuals()
-    model = {
-        "short_range_length_m": short_range_length_m,
-        "loss_scale": loss_scale,
-        "loss_is_bounded": loss_is_bounded,
-    }
-    groups = rows_by_key(ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
-    for rows in groups:
-        cost = _cost(ranges, rows, blocks, model)
-        add_residual_block(adjuster, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
-    return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
-
-
-def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mapping[str, Any]) -> pyceres.CostFunction:
-    from rangesfm import _cpp
-
-    measured = {
-        "range_m": ranges.range_m[rows],
-        "stddev_m": ranges.stddev_m[rows],
-        "share": np.ones(len(rows)) if ranges.share is None else ranges.share[rows],
-        "loadings_m": None if ranges.loadings_m is None else ranges.loadings_m[rows],
-        "tag_in_cam_m": None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
-        **model,
-    }
-    if ranges.before[rows[0]] == ranges.after[rows[0]]:
-        return _cpp.range_cost(**measured)
-    return _cpp.interpolated_range_cost(
-        **measured,
-        weight=ranges.weight[rows],
-        offset_in_world_m=ranges.offset_in_world_m[rows],
-        interval_s=None if blocks.time_shift is None else ranges.interval_s[rows[0]],  # type: ignore[index]
-    )
-
-
-def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> list[Array]:
-    """Return the parameter blocks of a group in the order of its cost."""
-    before, after, anchor, tag = (
-        int(index[row]) for index in (ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
-    )
-    found = [blocks.poses[before]]
-    if before != after:
-        found.append(blocks.poses[after])
-    found += [blocks.anchors[anchor], blocks.biases[anchor]]
-    if blocks.lever_arms_are_free:
-        found.append(blocks.tags_in_cam[tag])
-    if blocks.time_shift is not None and before != after:
-        found.append(blocks.time_shift)
-    if blocks.amplitude is not None:
-        found.append(blocks.amplitude)
-    return [*found, *blocks.shared]
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm import solver
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.measurements.kind import Block, ByBlock, Doubt, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
@@ -28,6 +28,8 @@ from rangesfm.util.geometry.trajectory import Trajectory
 
 CLOCK: Block = ("clock", "ranges")
 SHORT: Block = ("short range error", "ranges")
+# Largest size of a block of numbers that all ranges share: as many as a pose has columns, for Ceres' fastest kernels.
+_MAX_NUM_SHARED = 6
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,8 @@ class Ranges(Measurements):
     def _shared(self) -> list[tuple[Block, int, int]]:
         """Names of the blocks of shared errors, and the first and the last of the numbers of each."""
         num = self.shared_errors_m.shape[1]
-        starts = range(0, num, solver.MAX_NUM_SHARED)
-        return [(("shared", f"ranges {k}"), k, min(k + solver.MAX_NUM_SHARED, num)) for k in starts]
+        starts = range(0, num, _MAX_NUM_SHARED)
+        return [(("shared", f"ranges {k}"), k, min(k + _MAX_NUM_SHARED, num)) for k in starts]
 
     def priors(self) -> Iterator[Prior]:
         """Yield what is known of the blocks."""
@@ -229,39 +231,40 @@ class Ranges(Measurements):
         return float(state.blocks[CLOCK][0]) if CLOCK in state.blocks else 0.0
 
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
+        """Add the costs: one residual block for the ranges of one place, anchor and tag, each of which is robust alone.
+
+        The solver's work grows with the number of blocks and of pairs of blocks that share a residual, and much less
+        with the number of residuals in a block.
+        """
         log, rows, at = self.observations.log, self.rows, self.places.subset(self.rows)
-        placed = solver.PlacedRanges(
-            range_m=log.range_m[rows],
-            stddev_m=self.errors.stddev_m,
-            before=at.before,
-            after=at.after,
-            weight=at.fraction,
-            offset_in_world_m=at.offset_m,
-            anchor_index=log.anchor_index[rows],
-            tag_index=log.tag_index[rows],
-            interval_s=at.interval_s,
-            share=adjustment.pixel_stddev**2 * self.errors.worth,
-            loadings_m=self.shared_errors_m[rows],
-        )
-        is_free = self.options.lever_arm_stddev_m > 0
-        own = solver.RangeBlocks(
-            poses=poses,
-            anchors=[blocks["anchor", each.anchor_id] for each in self.anchors],
-            biases=[blocks["bias", each.anchor_id] for each in self.anchors],
-            tags_in_cam=[blocks[name] for name in self._arm_names] if is_free else list(self.tags_in_cam_m),
-            lever_arms_are_free=is_free,
-            time_shift=blocks.get(CLOCK),
-            amplitude=blocks.get(SHORT),
-            shared=[blocks[name] for name, _, _ in self._shared],
-        )
-        solver.add_ranges(
-            adjustment.adjuster,
-            placed,
-            own,
-            short_range_length_m=SHORT_RANGE_LENGTH_M if SHORT in blocks else None,
-            loss_scale=self.errors.loss.width,
-            loss_is_bounded=self.errors.loss.is_bounded,
-        )
+        anchor_index, tag_index = log.anchor_index[rows], log.tag_index[rows]
+        arm_is_free, share = self.options.lever_arm_stddev_m > 0, adjustment.pixel_stddev**2 * self.errors.worth
+        for group in rows_by_key(at.before, at.after, anchor_index, tag_index):
+            before, after, anchor, tag = (
+                int(index[group[0]]) for index in (at.before, at.after, anchor_index, tag_index)
+            )
+            measured: dict[str, Any] = {
+                "range_m": log.range_m[rows[group]],
+                "stddev_m": self.errors.stddev_m[group],
+                "share": share[group],
+                "loadings_m": self.shared_errors_m[rows[group]],
+                "tag_in_cam_m": None if arm_is_free else self.tags_in_cam_m[tag],
+                "short_range_length_m": SHORT_RANGE_LENGTH_M if SHORT in blocks else None,
+                "loss_scale": self.errors.loss.width,
+                "loss_is_bounded": self.errors.loss.is_bounded,
+            }
+            anchor_id = self.anchors[anchor].anchor_id
+            names = [("anchor", anchor_id), ("bias", anchor_id), *([self._arm_names[tag]] if arm_is_free else ())]
+            if before == after:
+                cost, ends = solver.range_cost(**measured), [poses[before]]
+            else:
+                interval_s = at.interval_s[group[0]] if CLOCK in blocks else None
+                cost = solver.interpolated_range_cost(
+                    **measured, weight=at.fraction[group], offset_in_world_m=at.offset_m[group], interval_s=interval_s
+                )
+                ends, names = [poses[before], poses[after]], [*names, *([CLOCK] if CLOCK in blocks else ())]
+            names += [*([SHORT] if SHORT in blocks else ()), *(name for name, _, _ in self._shared)]
+            solver.add_residual_block(adjustment.adjuster, cost, None, [*ends, *(blocks[name] for name in names)])
 
     def at_blocks(self, blocks: Mapping[Block, Array]) -> Ranges:
         return replace(self, anchors=anchors_at(self.anchors, blocks))
