@@ -78,7 +78,7 @@ class Noise:
     sizes: Array
     covariances_m2: Array
 
-    @property
+    @cached_property
     def covariance_m2(self) -> Array:
         """(c, c) covariance of all components together, square metres."""
         return np.asarray(self.covariances_m2.sum(axis=0))

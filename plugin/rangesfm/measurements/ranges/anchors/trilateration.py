@@ -1,43 +1,60 @@
 """Trilateration: positions of anchors from ranges at known positions of the tag.
 
-This is the first step of Lee, Zhu, Giorgi and Günther (2018), with robust estimation and a realistic uncertainty. Every
-anchor is located on its own. The errors of the ranges are learnt from those of all anchors together.
+It is the estimate of a run with the path held: the same robust fit, errors and best weights (sections 4 to 7 of
+``model.md``). The errors are learnt from the ranges to all anchors together. Lee, Zhu, Giorgi and Günther (2018) begin
+with it, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import null_space
+from scipy.optimize import brentq
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
-from rangesfm.measurements.ranges.anchors.point_fit import (
-    ENOUGH_TO_JUDGE,
-    JudgedFit,
-    PointFit,
-    fit_with_own_noise,
-    judged_fits,
-    known_directions,
-)
+from rangesfm.measurements.ranges.anchors.point_fit import likeliest_state
+from rangesfm.measurements.ranges.errors.noise import MIN_NUM_OF_SCATTER, START_STDDEV_M
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.range_log import RangeLog
-from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, cost_at, solve
-from rangesfm.util.geometry.moments import ByPhoto
-from rangesfm.util.geometry.numerics import UNDETERMINED
-from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
-from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
+from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
+from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, cost_at, solve, state_after
+from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.scale.scale_problem import (
+    MIN_NUM_RANGES,
+    RangesOnPath,
+    ScaleProblem,
+    walking_times_s,
+)
+from rangesfm.measurements.ranges.scale.solution import solution_from
+from rangesfm.options import RangeModelOptions
+from rangesfm.solver.bending import WalkBending
+from rangesfm.solver.linear_map import Solved
+from rangesfm.solver.noise import Component
+from rangesfm.solver.posterior import joined
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP, SAME_COST
+from rangesfm.util.geometry.similarity import IDENTITY, NEARLY_STRAIGHT, PathShape, oriented, path_shape
+from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import with_one_blas_thread
 
-# Three ranges determine a position, and a fourth one checks it.
-MIN_NUM_RANGES = 4
-# Standard deviations above this fraction of the distance are computed from the cost itself, not from its curvature.
+# Standard deviations above this fraction of the distance are computed from the residuals themselves, not from their
+# derivatives.
 _NONLINEAR = 0.05
-# Distances at which the cost is then evaluated, metres.
-_PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
+# Distances at which the residuals are then evaluated, metres.
+_PROFILE_STEPS_M = tuple(0.01 * 2.0**n for n in range(14))
+# Standard deviation of a height that is known, metres.
+_KNOWN_STDDEV_M = 0.01
 # Id of an anchor without one.
 _ONE = "anchor"
 
@@ -88,11 +105,6 @@ class Trilateration:
     def position_stddev_m(self) -> float:
         """Root of the mean variance of the three coordinates, metres."""
         return float(np.sqrt(np.trace(self.covariance_m2) / 3))
-
-
-def walking_times_s(places_m: Array) -> Array:
-    """Return (n,) times, seconds, at which somebody who walks a metre a second is at (n, 3) places, from 0."""
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1)))
 
 
 @with_one_blas_thread
@@ -189,153 +201,216 @@ def trilaterate_anchors(
     Returns:
         One placement for each anchor, in the order of the log.
     """
-    num = len(log.anchor_ids)
-    rows = np.flatnonzero(np.isfinite(tag_positions_m).all(axis=1))
-    counts = np.bincount(log.anchor_index[rows], minlength=num)
-    rows = rows[np.argsort(log.anchor_index[rows], kind="stable")]
-    rows = rows[counts[log.anchor_index[rows]] >= MIN_NUM_RANGES]
-    index, given_m = log.anchor_index[rows], log.range_stddev_m[rows]
-    tags_m, found = tag_positions_m[rows], dict[int, JudgedFit]()
-    middle = tags_m.mean(axis=0) if len(rows) else np.zeros(3)
-    heights_m = np.array([height_m.get(anchor_id, np.nan) for anchor_id in log.anchor_ids])
-    problem = RangeProblem(
-        centers=np.zeros((len(rows), 3)),
-        tag_from_center=tags_m - middle,
+    is_known = np.isfinite(tag_positions_m).all(axis=1)
+    counts = np.bincount(log.anchor_index[is_known], minlength=len(log.anchor_ids))
+    rows = np.flatnonzero(is_known & (counts >= MIN_NUM_RANGES)[log.anchor_index])
+    placements = [
+        AnchorPlacement(name, num, None, f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed")
+        for name, num in zip(log.anchor_ids, counts.tolist(), strict=True)
+    ]
+    if not len(rows):
+        return tuple(placements)
+    # Near the origin, because large coordinates lose digits.
+    middle, heights_m = tag_positions_m[rows].mean(axis=0), [height_m.get(each, np.nan) for each in log.anchor_ids]
+    posed = _on_given_path(log, rows, tag_positions_m - middle, np.array(heights_m) - middle[2], options)
+    for k, located, fitted in _located(posed):
+        told = np.asarray(toward.get(log.anchor_ids[k], np.zeros(3)), np.float64)
+        try:
+            found, why_not = _concluded(located, fitted, k, middle, told, options), ""
+        except GeometryError as error:
+            found, why_not = None, str(error)
+        placements[k] = replace(placements[k], found=found, why_not=why_not)
+    return tuple(placements)
+
+
+def _on_given_path(
+    log: RangeLog, rows: Indices, tags_m: Array, heights_m: Array, options: TrilaterationOptions
+) -> ScaleProblem:
+    """Pose the problem of unknown anchors beside a path that is given.
+
+    The path is a camera that stands still with the tag anywhere beside it: lever arms are in metres, and never scale.
+
+    Args:
+        rows: of the ranges that take part. tags_m: (n, 3). heights_m: (m,) of the anchors; NaN where unknown.
+    """
+    if isinstance(log.moments, ByPhoto):
+        times_s = np.zeros(len(log))
+        for k in np.unique(log.anchor_index[rows]):
+            own = rows[log.anchor_index[rows] == k]
+            times_s[own] = walking_times_s(tags_m[own])
+        log = replace(log, moments=ByTime(times_s))
+    index, num = log.anchor_index[rows], len(log.anchor_ids)
+    nothing, origin, one_pose = np.zeros(len(log)), np.zeros((len(log), 3)), np.zeros(len(log), dtype=np.int64)
+    status = np.full(len(log), RangeStatus.NO_KEYFRAME_NEAR, dtype=np.int8)
+    status[rows] = RangeStatus.USED
+    observations = RangeObservations(
+        log, status, one_pose, one_pose, nothing, origin, origin, tags_m, center_stddev=nothing, arm_stddev_m=nothing
+    )
+    still = Trajectory(np.zeros(1, dtype=np.int64), ("",), None, np.zeros((1, 3)), np.eye(3)[None])
+    # So few residuals do not show the noise, as place and bias of each anchor follow them.
+    is_shown = len(rows) - MIN_NUM_RANGES * len(np.unique(index)) >= MIN_NUM_OF_SCATTER
+    model = RangeModelOptions(
+        range_stddev_m=options.range_stddev_m or (None if is_shown else START_STDDEV_M),
+        range_bias_stddev_m=options.range_bias_stddev_m,
+        common_bias_stddev_m=0.0,
+    )
+    errors = RangeErrors.begin(observations, rows, model)
+    ranges = RangeProblem(
+        centers=origin[rows],
+        tag_from_center=tags_m[rows],
         anchor_index=index,
         range_m=log.range_m[rows],
-        stddev_m=np.ones(len(rows)),
-        anchor_mean_m=np.column_stack([np.full((num, 2), np.nan), heights_m - middle[2]]),
-        anchor_stddev_m=np.full(num, np.inf),
+        stddev_m=errors.stddev_m,
+        anchor_mean_m=np.column_stack([np.full((num, 2), np.nan), heights_m]),
+        anchor_stddev_m=np.where(np.isnan(heights_m), np.inf, _KNOWN_STDDEV_M),
         bias_mean_m=np.full(num, options.range_bias_m),
         bias_stddev_m=np.full(num, options.range_bias_stddev_m),
         common_bias_stddev_m=0.0,
         frame_is_free=False,
-        share=np.ones(len(rows)),
+        share=errors.share,
+        # Nothing depends on the scale of a camera that stands still, and this keeps it as it is.
+        distances=LocatedDistances.between_points(*np.ones((3, 1))),
     )
-    if len(rows):
-        given_m = np.where(np.isfinite(given_m), given_m, options.range_stddev_m or np.nan)
-        curve_m = log.shared_stddev_m[rows]
-        heard = np.unique(index)
-        fits = [fit_with_own_noise(problem.of_anchor(k), curve_m[index == k], given_m[index == k]) for k in heard]
-        by_walk = [walking_times_s(tags_m[index == k]) for k in heard] if isinstance(log.moments, ByPhoto) else []
-        times_s = np.concatenate(by_walk) if by_walk else log.timestamp_s[rows]
-        found = dict(zip(heard.tolist(), judged_fits(fits, times_s, log.tag_index[rows], curve_m), strict=True))
-    placements = []
-    for k, anchor_id in enumerate(log.anchor_ids):
-        placed, why_not = None, f"{counts[k]} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
-        if k in found:
-            try:
-                told = np.asarray(toward.get(anchor_id, np.zeros(3)), np.float64)
-                placed, why_not = _conclude(found[k].balanced(), middle, told, options), ""
-            except GeometryError as error:
-                why_not = str(error)
-        placements.append(AnchorPlacement(anchor_id, int(counts[k]), placed, why_not))
-    return tuple(placements)
+    given = RangesOnPath(observations, still, WalkBending(still), (), "unknown", model)
+    upright = np.tile(np.eye(3), (len(rows), 1, 1))
+    return ScaleProblem(given, ranges, upright, None, errors, rows, (), ())
 
 
-def _conclude(found: JudgedFit, middle: Array, toward: Array, options: TrilaterationOptions) -> Trilateration:
-    """Return the position with its mirror image, in a frame in which ``middle`` is the problem's origin.
+def _located(posed: ScaleProblem) -> Iterator[tuple[int, Linearized, RangesOnMap]]:
+    """Yield each anchor at its likeliest place, with the errors that all ranges show; and the robust fit of all."""
+    problem, before = posed.ranges, posed.errors
+    state = RangeState(IDENTITY, np.zeros((problem.num_anchors, 3)), problem.bias_mean_m.copy())
+    noise_m = np.where(before.is_estimated, START_STDDEV_M, before.given_m)
+    for k in np.unique(problem.anchor_index):
+        own = problem.anchor_index == k
+        found = likeliest_state(problem.of_anchor(k), noise_m[own], before.shared_m[own])
+        state.anchors_m[k], state.bias_m[k] = found.anchors_m[0], found.bias_m[0]
+    fitted, index = solution_from(posed, state), problem.anchor_index
+    sizes = _in_bins(fitted).learnt().sizes
+    for k in np.unique(index).tolist():
+        # As many bins for each anchor as for all: in those of all, what tells the places would be averaged away over a
+        # long log. The others are held.
+        is_own = np.arange(problem.num_anchors) == k
+        alone = replace(problem, anchor_stddev_m=np.where(is_own, problem.anchor_stddev_m, 0.0))
+        of_one = replace(fitted.with_problem(alone), weights=np.where(index == k, fitted.weights, 0.0))
+        yield k, replace(_in_bins(of_one), sizes=sizes).settled(fitted.state), fitted
+
+
+def _in_bins(on_map: RangesOnMap) -> Linearized:
+    """Return the linear problem of ranges, whose biases have the prior that was given."""
+    observed, bias_stddev_m = binned_ranges(on_map), float(on_map.problem.bias_stddev_m[0])
+    index = observed.bins.anchor_index
+    own_bias = Component("bias", (index[:, None] == index).astype(np.float64), bias_stddev_m)
+    others = (each for each in observed.components if each.name not in ("bias", "common_bias"))
+    problem = joined([replace(observed, components=(*others, own_bias))], on_map.bending)
+    return Linearized(**vars(problem), on_map=on_map, bins=observed.bins, scatter_m=on_map.noise_stddev_m)
+
+
+def _concluded(
+    located: Linearized, fitted: RangesOnMap, k: int, middle: Array, toward: Array, options: TrilaterationOptions
+) -> Trilateration:
+    """Return the position of an anchor with its mirror image, in a frame in which ``middle`` is the problem's origin.
 
     Raises:
         GeometryError: the position is less certain than wanted.
     """
-    covariance, tags_m = _covariance(found), found.point.problem.tag_from_center
-    height_is_known = bool(np.isfinite(found.point.problem.anchor_mean_m[0, 2]))
+    covariance, problem = _covariance(located, k), located.on_map.problem
+    own = problem.anchor_index == k
+    tags_m, height_is_known = problem.tag_from_center[own], bool(np.isfinite(problem.anchor_mean_m[k, 2]))
     shape = path_shape(tags_m * [1.0, 1.0, 0.0] if height_is_known else tags_m)
     _refuse_uncertain(covariance, shape, options)
     # With a known height, position and mirror image have the same height, and the plane between them is vertical.
     level = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
     across = oriented(level[:, None])[:, 0] if height_is_known else shape.axes[:, 2]
-    mirror = _mirror(found, covariance, shape.centroid, across)
-    if mirror is not None:
-        apart = mirror.at_m - found.point.at_m
-        # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
-        least = UNDETERMINED * float(np.linalg.norm(toward) * np.linalg.norm(apart))
-        told = toward if abs(toward @ apart) > least else None
-        # If both have the same cost, the choice would depend on rounding, so the order is fixed.
-        is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
-        if is_free and apart @ (across if told is None else told) > 0:
-            found, mirror = replace(found, point=mirror), found.point
-            covariance = _covariance(found)
-        mirror = mirror if told is None else None
+    mirrored, gap = _mirror_image(fitted, k, shape.centroid, across)
+    mirror = located.settled(mirrored) if gap < MIN_COST_GAP else located
+    apart = _place_m(mirror, k) - _place_m(located, k)
+    is_open = bool(apart @ apart > 2 * np.sqrt(apart @ covariance @ apart))
+    tells = bool(abs(toward @ across) > UNDETERMINED * np.linalg.norm(toward))
+    # If both fit equally well, the choice would depend on rounding, so the order is fixed.
+    if is_open and (tells or abs(gap) < SAME_COST) and apart @ (toward if tells else across) > 0:
+        located, mirror = mirror, located
+        covariance = _covariance(located, k)
+    bias_m, bias_stddev_m = _bias(located, k)
+    noise_m = np.where(located.on_map.posed.errors.is_estimated, located.scatter_m, located.on_map.posed.errors.given_m)
     return Trilateration(
-        position_m=middle + found.point.at_m,
-        covariance_m2=covariance[:3, :3],
-        mirror_position_m=None if mirror is None else middle + mirror.at_m,
-        range_bias_m=found.point.bias_m,
-        range_bias_stddev_m=float(np.sqrt(np.diag(covariance)[3:].sum())),  # none if the bias is known
-        noise_stddev_m=found.point.noise_m,
-        residuals_m=found.point.fit.residuals_m,
-        weights=found.point.fit.weights,
+        position_m=middle + _place_m(located, k),
+        covariance_m2=covariance,
+        mirror_position_m=middle + _place_m(mirror, k) if is_open and not tells else None,
+        range_bias_m=options.range_bias_m + bias_m,
+        range_bias_stddev_m=bias_stddev_m,
+        noise_stddev_m=float(np.median(noise_m[own])),
+        residuals_m=located.on_map.residual_m[own] + bias_m,
+        weights=located.on_map.weights[own],
     )
 
 
-def _covariance(found: JudgedFit) -> Array:
-    """Return the covariance (q, q) of the position and, unless it is known, the bias, given the errors of the ranges.
+def _place_m(located: Linearized, k: int) -> Array:
+    return np.asarray(located.on_map.state.anchors_m[k])
 
-    It is the sandwich covariance of a robust estimate: the covariance of the gradient between two inverses of the
-    information (Huber and Ronchetti, "Robust Statistics", 2009, section 6.3). The weakest direction may instead be
-    evaluated by the cost itself.
+
+def _bias(located: Linearized, k: int) -> tuple[float, float]:
+    """Return the bias of an anchor's ranges from its prior mean, and its standard deviation, metres."""
+    solved = located.linear.solved(located.noise.covariance_m2)
+    stddev_m = float(located.on_map.problem.bias_stddev_m[k])
+    of_bins = stddev_m**2 * (located.bins.anchor_index == k)
+    of_all = np.append(of_bins, np.zeros(len(located.linear.prior_residual)))
+    left = solved.left(solved.whitened(of_all[:, None]))[:, 0]
+    return -float(left @ solved.residual), float(np.sqrt(np.maximum(stddev_m**2 - left @ left, 0.0)))
+
+
+def _covariance(located: Linearized, k: int) -> Array:
+    """Return the covariance (3, 3) of an anchor's position.
+
+    Near the plane of the tag's positions the derivatives of the ranges by the distance from the plane vanish, but the
+    residuals rise farther off. So the standard deviation in the weakest direction may be the distance at which the
+    misfit is higher by that of one standard deviation.
     """
-    point, weights, stddev_m = found.point, found.point.fit.weights, found.point.problem.stddev_m
-    jacobian, prior = point.slopes / stddev_m[:, None], point.prior(found.inflation_of_prior)
-    of_prior = prior.T @ prior
-    inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
-    influence = inverse @ (jacobian * (weights / stddev_m)[:, None]).T
-    sandwich = found.of_sums(influence) + found.inflation_of_prior**2 * inverse @ of_prior @ inverse
-    return _with_weak_direction(found, sandwich, inverse)
+    noise_m2, own = located.noise.covariance_m2, located.columns.anchor[k] + np.arange(3)
+    whole = located.linear.solved(noise_m2).covariance
+    covariance: Array = whole[np.ix_(own, own)]
+    variances, axes = np.linalg.eigh(covariance)
+    along, problem = axes[:, 2], located.on_map.problem
+    if np.sqrt(variances[2]) < _NONLINEAR * float(np.median(problem.range_m[problem.anchor_index == k])):
+        return covariance
+    # How all else changes with this direction, to first order, and the directions in which it is free.
+    tied, held = whole[:, own] @ along / variances[2], np.zeros((1, len(whole)))
+    held[0, own] = along
+    free = null_space(held)
 
+    def solved(at: Linearized) -> Solved:
+        linear = at.linear
+        return replace(linear, design=linear.design @ free, prior_design=linear.prior_design @ free).solved(noise_m2)
 
-def _inverse(information: Array) -> Array:
-    # Position and bias are scaled to units of their own. In metres, the large information of a bias that is known well
-    # would hide that of the position.
-    strongest = np.diag(information)
-    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3:]))
-    values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
-    inverse: Array = unit[:, None] * ((vectors / np.maximum(values, 1e-12)) @ vectors.T) * unit
-    return inverse
+    def misfit(distance_m: float) -> float:
+        """Return the misfit at a distance along the direction, with all else adapted."""
+        moved, step, found = located, distance_m * tied, np.inf
+        for _ in range(MAX_NUM_ROUNDS):
+            state = state_after((located.columns,), moved.on_map.state, step)
+            moved, before = located.at_state(replace(located.on_map, state=state)), found
+            best = solved(moved)
+            found, step = float(best.residual @ best.residual), np.zeros(len(tied))
+            if abs(before - found) < NEGLIGIBLE_STDDEVS:
+                break
+            step[own] = free[own] @ best.step
+        return found
 
+    most = misfit(0.0) + 1.0
 
-def _with_weak_direction(found: JudgedFit, sandwich: Array, formal: Array) -> Array:
-    """Return the covariance with the variance of the weakest direction from the cost itself, where that is needed.
+    def reached(side: float) -> float:
+        near = 0.0
+        for far in _PROFILE_STEPS_M:
+            if misfit(side * far) > most:
+                return float(brentq(lambda at: misfit(side * at) - most, near, far, rtol=_NONLINEAR))
+            near = far
+        return near
 
-    Near the plane of the tag's positions, the curvature of the cost across the plane vanishes, but the cost rises
-    farther off.
-    """
-    variances, axes = np.linalg.eigh(formal[:3, :3])
-    along = np.append(axes[:, 2], np.zeros(len(formal) - 3))
-    # The other unknowns are assumed to change with this direction as the curvature says.
-    tied = formal @ along / variances[2]
-    inflation = found.inflation(found.point.slopes @ tied)
-    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.point.problem.range_m)):
-        return sandwich
-    rest = np.eye(len(formal)) - np.outer(tied, along)
-    changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
-    return changed
-
-
-def _profile_stddev(found: JudgedFit, along: Array, inflation: float) -> float:
-    """Return the distance along a direction (q,) at which the cost has risen by that of one standard deviation, metres.
-
-    The other unknowns are estimated anew at each distance.
-    """
-    num = len(found.point.problem.range_m)
-    rows = np.linspace(0, num - 1, min(num, ENOUGH_TO_JUDGE)).astype(np.int64)
-    part = found.judged_by(inflation).subset(rows)
-    held = known_directions(part)
-    best = solve(part, found.point.fit.state, held=held)
-    allowed = best.cost + 0.5 * len(rows) / num
-
-    def is_far(step: float) -> bool:
-        moved = replace(best.state, anchors_m=best.state.anchors_m + step * along[:3])
-        return solve(part, moved, held=(*held, np.append(0.0, along))).cost > allowed
-
-    last = _PROFILE_STEPS_M[-1]
-    return float(max(next((step for step in _PROFILE_STEPS_M if is_far(sign * step)), last) for sign in (1, -1)))
+    of_free = free[own] @ solved(located).covariance @ free[own].T
+    return np.asarray(of_free + max(reached(1.0), reached(-1.0)) ** 2 * np.outer(along, along))
 
 
 def _refuse_uncertain(covariance: Array, shape: PathShape, options: TrilaterationOptions) -> None:
-    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    variances, axes = np.linalg.eigh(covariance)
     stddev = float(np.sqrt(variances[2]))
     if stddev <= options.max_position_stddev_m:
         return
@@ -355,21 +430,16 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     )
 
 
-def _mirror(found: JudgedFit, covariance: Array, centroid: Array, across: Array) -> PointFit | None:
-    """Return the fit of the mirror image in the tag's positions, if it is a different one and fits."""
-    at_m = found.point.at_m
-    other = found.point.near(at_m - 2 * float((at_m - centroid) @ across) * across)
-    apart = other.at_m - at_m
-    distance = float(np.linalg.norm(apart))
-    stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
-    return other if distance > 2 * stddev and _gap(found, other) < MIN_COST_GAP else None
-
-
-def _gap(found: JudgedFit, mirror: PointFit) -> float:
-    """Return the cost of the mirror image minus that of the fit, with common errors of the ranges accounted for.
+def _mirror_image(fitted: RangesOnMap, k: int, centroid: Array, across: Array) -> tuple[RangeState, float]:
+    """Return the state of a fit with an anchor mirrored in the tag's positions, and how much higher its cost is.
 
     The loss is bounded, so that outliers cost the same for both.
     """
-    fit, other = found.point.fit, mirror.fit
-    judged = found.judged_by(found.inflation(other.residuals_m - fit.residuals_m))
-    return cost_at(judged, other.state, GEMAN_MCCLURE) - cost_at(judged, fit.state, GEMAN_MCCLURE)
+    state, alone, loss = fitted.state, fitted.weighted.of_anchor(k), fitted.errors.loss
+    here = RangeState(IDENTITY, state.anchors_m[k : k + 1], state.bias_m[k : k + 1])
+    off_m = (here.anchors_m - centroid) @ across
+    fit = solve(alone, replace(here, anchors_m=here.anchors_m - 2 * off_m[:, None] * across), loss=loss)
+    anchors_m = state.anchors_m.copy()
+    anchors_m[k] = fit.state.anchors_m[0]
+    gap = (fit.cost - cost_at(alone, here, loss)) / fitted.errors.inflation**2
+    return replace(state, anchors_m=anchors_m), gap

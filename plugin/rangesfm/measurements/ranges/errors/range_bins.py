@@ -108,14 +108,13 @@ def range_bins(
     since = time_s - time_s.min()
     distance = np.linalg.norm(from_anchor_m, axis=1)
     towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
-    of_range = _labels(anchor_index, tag_index, since, max_num)
     takes_part = robust_weight >= _NO_WEIGHT
     if not takes_part.any():
         robust_weight, takes_part = np.full_like(robust_weight, _NO_WEIGHT), ~takes_part
     robust_weight = np.where(takes_part, robust_weight, 0.0)
-    kept, first_of_kept = np.unique(of_range[takes_part], return_index=True)
-    first = np.flatnonzero(takes_part)[first_of_kept]
-    of_range = np.where(np.isin(of_range, kept), np.searchsorted(kept, of_range), 0)
+    rows, of_range = np.flatnonzero(takes_part), np.zeros(len(since), dtype=np.int64)
+    of_range[rows] = _labels(anchor_index[rows], tag_index[rows], since[rows], max_num)
+    first = rows[np.unique(of_range[rows], return_index=True)[1]]
     begun = RangeBins(
         of_range=of_range,
         robust_weight=robust_weight,

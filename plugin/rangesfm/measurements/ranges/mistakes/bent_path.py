@@ -161,12 +161,12 @@ def _likelier_sides(on_map: RangesOnMap, unknown: Sequence[int]) -> AnchorSides:
     mirrors_m: dict[str, Array | None] = {on_map.anchor_ids[k]: None for k in unknown}
     has_crossed = False
     problem = linearized(on_map).with_learnt_errors()
-    problem = _settled(problem, on_map.state).with_learnt_errors()
+    problem = problem.settled(on_map.state).with_learnt_errors()
     for k in unknown:
         other = _on_other_side(problem, k)
         if np.linalg.norm(_place_m(other, k) - _place_m(problem, k)) < problem.scatter_m:  # there is one place only
             continue
-        gain = _misfit(problem) - _misfit(other)
+        gain = problem.misfit - other.misfit
         if gain > 0:  # learning the errors takes time, and it hardly changes which side fits better
             other = other.with_learnt_errors()
             gain = Factorization(problem).deviance() - Factorization(other).deviance()
@@ -188,19 +188,4 @@ def _on_other_side(problem: Linearized, k: int) -> Linearized:
     path = path_shape(tags_m[on_map.problem.anchor_index == k])
     normal = path.axes[:, 2]
     anchors_m[k] -= 2 * ((anchors_m[k] - path.centroid) @ normal) * normal
-    return _settled(problem, replace(on_map.state, anchors_m=anchors_m))
-
-
-def _settled(problem: Linearized, state: RangeState) -> Linearized:
-    """Return the problem at the likeliest state near another one."""
-    problem = problem.at_state(replace(problem.on_map, state=state))
-    for _ in range(MAX_NUM_ROUNDS):
-        before, problem = problem, problem.after_step()
-        if is_nearly_at(problem.on_map, before.on_map, problem.scatter_m):
-            break
-    return problem
-
-
-def _misfit(problem: Linearized) -> float:
-    left = Factorization(problem).residual
-    return float(left @ left)
+    return problem.settled(replace(on_map.state, anchors_m=anchors_m))

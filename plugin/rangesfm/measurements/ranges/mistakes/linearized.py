@@ -15,7 +15,7 @@ from rangesfm.measurements.ranges.errors.learned import is_widened, widening
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
-from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, state_after
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.posterior import JointProblem, joined
@@ -143,6 +143,21 @@ class Linearized(JointProblem):
             if cost(moved) <= before:
                 return moved
         return self
+
+    def settled(self, state: RangeState) -> Linearized:
+        """Return the problem at the likeliest state near another one."""
+        problem = self.at_state(replace(self.on_map, state=state))
+        for _ in range(MAX_NUM_ROUNDS):
+            before, problem = problem, problem.after_step()
+            if is_nearly_at(problem.on_map, before.on_map, problem.scatter_m):
+                break
+        return problem
+
+    @property
+    def misfit(self) -> float:
+        """Squared residuals that the unknowns leave, in standard deviations, with those of the priors."""
+        left = self.linear.solved(self.noise.covariance_m2).residual
+        return float(left @ left)
 
 
 def linearized(on_map: RangesOnMap) -> Linearized:

@@ -43,7 +43,9 @@ def binned_ranges(on_map: RangesOnMap, max_num_bins: int = MAX_NUM_OBSERVATIONS)
     """
     own, others_m2 = on_map.with_problem(on_map.problem.without_others()), dict[OtherError, Array]()
     noise_of_anchor = noisiness(own.problem.anchor_index, own.fit_residual_m, own.problem.num_anchors)
-    bins = own.bins(own.weights, noise_of_anchor, max_num_bins)
+    # A range of which the log states the noise counts by that.
+    precision = np.where(own.errors.is_estimated, own.noise_stddev_m, own.errors.given_m) ** -2.0
+    bins = own.bins(own.weights * (precision / np.median(precision)), noise_of_anchor, max_num_bins)
     if own.posed.velocity is not None and (clock_s := own.posed.observations.time_offset_stddev_s):
         rates = bins.mean(own.by_time)
         others_m2[CLOCKS] = clock_s**2 * np.outer(rates, rates)

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import null_space
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -46,7 +45,7 @@ class RangeProblem:
         range_m: (n,) measured ranges.
         stddev_m: (n,) standard deviation of their noise.
         anchor_mean_m: (m, 3) prior positions in the metric world; NaN where unknown.
-        anchor_stddev_m: (m,) of each prior coordinate; 0: exact, inf: unknown.
+        anchor_stddev_m: (m,) of each prior coordinate that is known; 0: exact, inf: all are unknown.
         bias_mean_m, bias_stddev_m: (m,) prior of each bias; standard deviation 0 fixes it.
         common_bias_stddev_m: prior of the bias that all free biases share, such as the tag's own delay.
         frame_is_free: whether rotation and translation are estimated; otherwise they stay as started.
@@ -239,7 +238,6 @@ def solve(
     start: RangeState,
     *,
     others: Sequence[RangeProblem] = (),
-    held: Sequence[Array] = (),
     loss: RobustLoss = CAUCHY,
     tolerance: float = ROUNDING,
 ) -> RangeFit:
@@ -249,19 +247,16 @@ def solve(
         others: problems of further models, each in its own unit and with its own ``frame_is_free``. Anchors, biases
             and all priors are taken from the first problem.
         start: initial values; an anchor without a position must have no ranges.
-        held: directions (p,) in the parameters of ``columns_of`` along which the state stays where it starts.
         loss: robust loss of the ranges.
         tolerance: relative change of cost and of parameters at which the solver stops. Candidates to choose among need
             not be at the very minimum.
     """
     columns = columns_of((problem, *others))
-    num = columns[0].num
-    free = null_space(np.reshape(held, (-1, num))) if held else np.eye(num)
-    system = _System((problem, *others), columns, start, loss, free)
+    system = _System((problem, *others), columns, start, loss)
     result = least_squares(
         lambda y: np.concatenate(system.residuals(system.state_after(y))),
-        np.zeros(free.shape[1]),
-        jac=lambda y: np.concatenate(system.jacobian(system.state_after(y))) @ free,
+        np.zeros(columns[0].num),
+        jac=lambda y: np.concatenate(system.jacobian(system.state_after(y))),
         loss=system.rho_with_derivatives,
         x_scale="jac",
         method="trf",
@@ -288,7 +283,7 @@ def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit
         weights: (n,) robust weights; larger than 1 for a range that stands for several.
     """
     columns = columns_of((problem,))
-    return _System((problem,), columns, state, CAUCHY, np.eye(columns[0].num)).fit(state, 0.0, weights)
+    return _System((problem,), columns, state, CAUCHY).fit(state, 0.0, weights)
 
 
 def _settled(system: _System, y: Array) -> Array:
@@ -311,20 +306,16 @@ def _settled(system: _System, y: Array) -> Array:
 
 @dataclass(frozen=True)
 class _System:
-    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state.
-
-    The state moves along (p, q) ``free`` directions only.
-    """
+    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state."""
 
     parts: tuple[RangeProblem, ...]
     columns: tuple[Columns, ...]
     start: RangeState
     loss: RobustLoss
-    free: Array
 
-    def state_after(self, y: Array) -> RangeState:
-        """Return the start moved by (q,) steps along the free directions."""
-        return state_after(self.columns, self.start, self.free @ y)
+    def state_after(self, x: Array) -> RangeState:
+        """Return the start moved by a parameter vector (p,)."""
+        return state_after(self.columns, self.start, x)
 
     @property
     def share(self) -> Array:
@@ -350,7 +341,7 @@ class _System:
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
 
     def slope(self, state: RangeState) -> tuple[Array, Array]:
-        """Return the (q,) gradient and the (q, q) curvature of the cost along the free directions.
+        """Return the (p,) gradient and the (p, p) curvature of the cost.
 
         As in scipy, a range beyond the inflection point of the loss adds no curvature.
         """
@@ -358,7 +349,7 @@ class _System:
         _, first, second = self.rho_with_derivatives(scaled**2)
         curvature = (jacobian * np.maximum(first + 2 * second * scaled**2, 0.0)[:, None]).T @ jacobian
         gradient = jacobian.T @ (first * scaled) + of_priors.T @ off_priors
-        return self.free.T @ gradient, self.free.T @ (curvature + of_priors.T @ of_priors) @ self.free
+        return gradient, curvature + of_priors.T @ of_priors
 
     def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
         """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
@@ -430,9 +421,10 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
     """Return the (r,) residuals of anchors, biases, distances, gravity and known positions, in standard deviations."""
     anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
+    off_anchor = off_anchor[~np.isnan(off_anchor)]
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
     of_distances = problem.distances.residuals(state.metric_from_model.scale, state.anchors_m)
-    priors = [off_anchor.ravel(), off_bias, of_distances]
+    priors = [off_anchor, off_bias, of_distances]
     if problem.gravity is not None and columns.frame >= 0:
         priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
     if problem.placement is not None and columns.frame >= 0:
@@ -449,11 +441,11 @@ def prior_cost(problem: RangeProblem, state: RangeState) -> float:
 def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
     """Return the (r, p) Jacobian of ``prior_residuals``."""
     anchors, biases = problem.uncertain
-    jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
-    for row, k in enumerate(anchors):
-        for axis in range(3):
-            jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
-    jacobian[3 * len(anchors) :, columns.bias[biases]] = problem.bias_whitening
+    known, axis = np.nonzero(~np.isnan(problem.anchor_mean_m[anchors]))
+    jacobian = np.zeros((len(known) + len(biases), columns.num))
+    column = columns.anchor[anchors[known]] + axis
+    jacobian[np.arange(len(known)), column] = 1 / problem.anchor_stddev_m[anchors[known]]
+    jacobian[len(known) :, columns.bias[biases]] = problem.bias_whitening
     similarity = state.metric_from_model
     of_distances = problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num)
     blocks = [jacobian, of_distances]

@@ -13,7 +13,6 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances, surveyed_distances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.anchors.trilateration import MIN_NUM_RANGES, walking_times_s
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import lengths_by_radio
@@ -28,6 +27,8 @@ from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import path_shape, rounding_of
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory
 
+MIN_NUM_RANGES = 4
+"""Fewest ranges that place an anchor: three determine a position, and a fourth one checks it."""
 MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
 
@@ -224,6 +225,11 @@ def turns_and_velocities(
     if is_by_photo or times_s is None or len(times_s) < 2 or (np.diff(times_s) <= 0).any():
         return turns, None
     return turns, np.asarray(np.gradient(trajectory.centers, times_s, axis=0)[nearest] @ world_from_first)
+
+
+def walking_times_s(places_m: Array) -> Array:
+    """Return (n,) times, seconds, at which somebody who walks a metre a second is at (n, 3) places, from 0."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1)))
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:
