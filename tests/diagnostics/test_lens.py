@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,7 @@ import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
-from rangesfm.diagnostics.lens import fit_lens
-from rangesfm.estimation.photo_bending import LARGEST_FACTOR
+from rangesfm.diagnostics.lens import doubts_of_lens
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -64,15 +62,11 @@ def test_pixels_that_are_no_squares_are_named_with_a_camera_model_that_has_them(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_said_of_a_lens_that_fits(seed: int) -> None:
-    fit = fit_lens(walk(seed))
-    assert fit is not None
-    assert fit.doubts(1.0, 0.0) == ()
+    assert doubts_of_lens(walk(seed), 1.0, 0.0) == ()
 
 
 def test_nothing_is_said_of_a_lens_whose_misfit_changes_lengths_by_less_than_the_interval() -> None:
     model = walk(0)
-    photograph_with_low_pixels(model, "SIMPLE_RADIAL", 0.9)
-    fit = fit_lens(model)
-    assert fit is not None
-    assert fit.doubts(LARGEST_FACTOR, 0.02)
-    assert replace(fit, change_95=0.01).doubts(LARGEST_FACTOR, 0.02) == ()
+    photograph_with_low_pixels(model, "SIMPLE_RADIAL", 0.95)
+    assert doubts_of_lens(model, 1.0, 0.01)
+    assert doubts_of_lens(model, 1.0, 0.03) == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from rangesfm.comparison.many_models import ModelsComparison, NamedModel
 from rangesfm.export.metric_map import colored_points
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
-from rangesfm.report.scene import Scene, ScenePath, view_of
+from rangesfm.report.scene import ScenePath, view_of
 from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -36,7 +37,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
             "comparison.html",
             title=f"{title} – rangesfm comparison",
             heading=title,
-            view=view_of(_scene(comparison, aligned, frame)),
+            view=_view(comparison, aligned, frame),
             sections=[
                 Section("models", "Models", tables=[similarity]),
                 Section("truth", "Reference", tables=[truth]),
@@ -56,8 +57,8 @@ def _unit(base: NamedModel) -> str:
     return "SfM units" if base.frame is None else "m"
 
 
-def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
-    """Return the scene with a model's map and all paths. The first model's is last: on that, cameras are chosen."""
+def _view(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> dict[str, Any]:
+    """Return the data of the view of a map and all paths. The first model's is last: on that, cameras are chosen."""
     models = [row.model for row in comparison.rows]
     base, mapped = models[0], next(row for row in comparison.rows if row.model.model.num_images())
     points_m, points_rgb = colored_points(mapped.model.model)
@@ -66,14 +67,13 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
         ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model.num_images() > 0)
         for i, (model, path) in enumerate(zip(models, aligned))
     ]
-    given = {} if base.result is None else base.result.summary.anchors
-    anchors = {id_: anchor for id_, anchor in given.items() if anchor.position_m is not None}
-    return Scene(
-        frame=frame,
-        paths=(*paths[1:], paths[0]),
-        points_m=points_m,
-        points_rgb=points_rgb,
-        anchors=anchors,
+    return view_of(
+        frame,
+        [*paths[1:], paths[0]],
+        points_m,
+        points_rgb,
+        np.zeros(0, dtype=np.int64),
+        anchors={} if base.result is None else base.result.summary.anchors,
         unit=_unit(base),
     )
 

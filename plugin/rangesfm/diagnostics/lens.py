@@ -7,7 +7,6 @@ model that has more parameters, all of them free.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,84 +43,49 @@ _ORIGIN = {"fx": "f", "fy": "f", "k1": "k"}
 _TRUST_REGION_RADIUS = 1e6
 
 
-@dataclass(frozen=True)
-class LensFit:
-    """The photos' fit with the cameras as they are and with richer ones.
+def doubts_of_lens(model: pycolmap.Reconstruction, bending_factor: float, half_width_95: float) -> tuple[Doubt, ...]:
+    """Return a doubt if the lens does not fit, and lengths are wrong by more than a good map's because of it.
 
-    Attributes:
-        models, richer_models: names of the camera models.
-        error_px, richer_error_px: medians of the points' reprojection errors.
-        gain: decrease of the sum of squares, over the variance with the richer ones.
-        num_params: parameters of the richer ones.
-        change_95: relative change of lengths in the map that 95 % of them do not exceed.
-    """
+    They are if they change by more than the scale's interval, or by more than any good scale's. Nothing is said where
+    the points are too few to tell, or the solver fails.
 
-    models: str
-    richer_models: str
-    error_px: float
-    richer_error_px: float
-    gain: float
-    num_params: int
-    change_95: float
-
-    def doubts(self, bending_factor: float, half_width_95: float) -> tuple[Doubt, ...]:
-        """Return a doubt if the lens does not fit, and lengths are wrong by more than a good map's because of it.
-
-        They are if they change by more than the scale's interval, or by more than any good scale's.
-
-        Errors of real features are alike in neighbouring photos, so that they bend a map by a multiple of what
-        independent errors would. The gain grows with its square: with the true lens of Strecha's fountain it is 10 to
-        13 times what independent errors give. So much may be gained with a lens that fits.
-
-        Args:
-            bending_factor: that multiple, as the refinement has learnt it.
-            half_width_95: of the scale's interval, relative.
-        """
-        factor = float(np.clip(bending_factor, MEDIAN_FACTOR, LARGEST_FACTOR))
-        is_by_chance = self.gain < factor**2 * special.chdtri(self.num_params, RISK)
-        if is_by_chance or self.change_95 <= min(half_width_95, DOUBTFUL_ABOVE):
-            return ()
-        is_richer = self.models != self.richer_models
-        other = self.richer_models if is_richer else "other parameters"
-        reason = (
-            f"the lens is not as the camera model {self.models} has it: with {other}, the map fits the photos to "
-            f"{self.richer_error_px:.2f} px instead of {self.error_px:.2f} px, and lengths in it change by up to "
-            f"{100 * self.change_95:.1f} %"
-        )
-        calibrate = "calibrate the camera and give model and params in [camera]"
-        again = f"map the photos again with --camera_model {self.richer_models}, or " if is_richer else ""
-        return (Doubt(reason, again + calibrate),)
-
-
-def fit_lens(model: pycolmap.Reconstruction, least_change: float = 0.0) -> LensFit | None:
-    """Return the fit with richer cameras; None where it would say nothing.
-
-    That is where lengths in the map hardly change with them, where the points are too few to tell, or the solver fails.
+    Errors of real features are alike in neighbouring photos, so that they bend a map by a multiple of what independent
+    errors would. The gain, by how much a richer lens lowers the sum of squares over its variance, grows with the square
+    of that: with the true lens of Strecha's fountain it is 10 to 13 times what independent errors give. So much may be
+    gained with a lens that fits.
 
     Args:
         model: with points; it is not changed.
-        least_change: relative change of lengths that matters.
+        bending_factor: that multiple, as the refinement has learnt it.
+        half_width_95: of the scale's interval, relative.
     """
     own, richer = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
     for camera in richer.cameras.values():
         _enrich(camera)
+    least_change = min(half_width_95, DOUBTFUL_ABOVE)
     try:
         after = _adjust(richer, lens_is_free=True)
         if _change_of_lengths(model, richer) <= least_change:
-            return None
+            return ()
         before = _adjust(own, lens_is_free=False)
     except SolverError:
-        return None
+        return ()
+    gain = (before.final_cost - after.final_cost) * after.num_residuals / after.final_cost
+    factor = float(np.clip(bending_factor, MEDIAN_FACTOR, LARGEST_FACTOR))
     num_params = sum(len(camera.params) for camera in richer.cameras.values())
-    return LensFit(
-        _names_of_models(own),
-        _names_of_models(richer),
-        point_errors(own).median_px,
-        point_errors(richer).median_px,
-        gain=(before.final_cost - after.final_cost) * after.num_residuals / after.final_cost,
-        num_params=num_params,
-        change_95=_change_of_lengths(own, richer),
+    change_95 = _change_of_lengths(own, richer)
+    if gain < factor**2 * special.chdtri(num_params, RISK) or change_95 <= least_change:
+        return ()
+    name, richer_name = _names_of_models(own), _names_of_models(richer)
+    is_richer = name != richer_name
+    reason = (
+        f"the lens is not as the camera model {name} has it: with {richer_name if is_richer else 'other parameters'}, "
+        f"the map fits the photos to {point_errors(richer).median_px:.2f} px instead of "
+        f"{point_errors(own).median_px:.2f} px, and lengths in it change by up to {100 * change_95:.1f} %"
     )
+    calibrate = "calibrate the camera and give model and params in [camera]"
+    again = f"map the photos again with --camera_model {richer_name}, or " if is_richer else ""
+    return (Doubt(reason, again + calibrate),)
 
 
 def _enrich(camera: pycolmap.Camera) -> None:

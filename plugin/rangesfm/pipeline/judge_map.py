@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.diagnostics.finished_map import doubts_of_points, doubts_of_refinement, place_of_map
-from rangesfm.diagnostics.lens import fit_lens
+from rangesfm.diagnostics.lens import doubts_of_lens
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.scale.scale_estimate import refuse_unknown
@@ -21,7 +21,6 @@ from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:
@@ -64,9 +63,7 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
         return ()
     is_learnt = any(each.shows_bending and each.is_used for each in metric.kinds)
     factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else LARGEST_FACTOR
-    half_width_95 = metric.estimate.uncertainty.half_width_95
-    fit = fit_lens(metric.final, min(half_width_95, DOUBTFUL_ABOVE))
-    return () if fit is None else fit.doubts(factor, half_width_95)
+    return doubts_of_lens(metric.final, factor, metric.estimate.uncertainty.half_width_95)
 
 
 def _tested(run: SurveyRun, metric: MetricResult) -> Diagnosis:

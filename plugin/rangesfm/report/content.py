@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 
@@ -21,21 +19,6 @@ from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_recons
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1
 """A range counts as taken at a photo if its time is within this fraction of the interval to the next photo."""
-
-
-@dataclass(frozen=True)
-class CameraIntrinsics:
-    """Intrinsics of one camera of the models.
-
-    Attributes:
-        title: COLMAP's camera id and camera model, and the size of the photos in pixels.
-        parameters: name, value before the refinement, and value after it (NaN without a refinement).
-        half_angles: half the width and half the height of the field of view at unit distance.
-    """
-
-    title: str
-    parameters: tuple[tuple[str, float, float], ...]
-    half_angles: tuple[float, float]
 
 
 class Content:
@@ -55,7 +38,7 @@ class Content:
             of shape (3,).
         points_m, points_rgb: (m, 3) positions and colours of the points of the final map.
         point_ids: (m,) their ids.
-        cameras: intrinsics in the scaled and in the refined model.
+        scaled_cameras, refined_cameras: cameras of both models by id, in order of the ids.
     """
 
     def __init__(
@@ -95,7 +78,9 @@ class Content:
         self.final, final = (self.refined, refined) if self.refined else (self.scaled, scaled)
         self.points_m, self.points_rgb = colored_points(final)
         self.point_ids = np.array(sorted(final.point3D_ids()), dtype=np.int64)
-        self.cameras = tuple(_cameras(scaled, refined))
+        self.scaled_cameras, self.refined_cameras = (
+            {camera_id: copy(camera) for camera_id, camera in sorted(model.cameras.items())} for model in models
+        )
         reference = result.read_reference()
         self.reference_m = reference.positions_m
         self.reference_by_photo = dict(zip(reference.moments.image_name, self.reference_m))
@@ -131,15 +116,3 @@ class Content:
                 tag = position + path.world_from_cam[index_of[name]] @ self.tags_in_cam_m[row]
                 distances[row] = np.linalg.norm(tag - anchor)
         return distances
-
-
-def _cameras(scaled: pycolmap.Reconstruction, refined: pycolmap.Reconstruction) -> Iterator[CameraIntrinsics]:
-    before, after = (dict(model.cameras) for model in (scaled, refined))
-    for camera_id, camera in sorted((after or before).items()):
-        names = [name.strip() for name in camera.params_info.split(",")]
-        unknown = [math.nan] * len(names)
-        values = [of_model[camera_id].params if camera_id in of_model else unknown for of_model in (before, after)]
-        title = f"{camera_id} {camera.model.name} {camera.width} × {camera.height}"
-        focal = camera.mean_focal_length()
-        half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
-        yield CameraIntrinsics(title, tuple(zip(names, *values)), half_angles)

@@ -301,13 +301,15 @@ def control_points(content: Content) -> ReportTable:
 
 def intrinsics(content: Content) -> ReportTable:
     """Return the table of the cameras' intrinsics before the refinement and, if there was one, after it."""
-    header = ["camera", "parameter", "scaled", "refined", "change"]
+    header, rows = ["camera", "parameter", "scaled", "refined", "change"], []
     num_columns = 5 if content.refined else 3
-    rows = [
-        [camera.title, name, fixed(before, 6), fixed(after, 6), signed(after - before, 6)][:num_columns]
-        for camera in content.cameras
-        for name, before, after in camera.parameters
-    ]
+    both = content.scaled_cameras, content.refined_cameras
+    for camera_id, camera in (both[1] or both[0]).items():
+        title = f"{camera_id} {camera.model.name} {camera.width} × {camera.height}"
+        for k, name in enumerate(camera.params_info.split(",")):
+            before, after = (of[camera_id].params[k] if camera_id in of else math.nan for of in both)
+            cells = [title, name.strip(), fixed(before, 6), fixed(after, 6), signed(after - before, 6)]
+            rows.append(cells[:num_columns])
     return ReportTable("Cameras", header[:num_columns], rows)
 
 

@@ -6,7 +6,7 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,43 +68,6 @@ class ScenePath:
     is_shown: bool = True
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Everything that the 3-D view shows, in one frame.
-
-    Attributes:
-        frame: "site" (z up), or any other name for the frame of a camera (y down).
-        paths: of cameras. The last one is the result; the reader chooses cameras on it.
-        points_m, points_rgb: (m, 3) positions and colours of the map's points.
-        anchors: those that have a position, by id.
-        point_ids: (m,) ids of the points in the model; empty if they are not known.
-        unit: of all lengths; "m" unless nobody knows the scale.
-        frustum_shape: half the width and half the height of the field of view at unit distance.
-        ranges, errors: data of the ranges, and of how the result errs; empty if these are not known.
-        thumbnails: of photos of the result, by name.
-        scale_interval: ends of the 95 % interval of the scale over its value; empty if it is not known.
-        notes: for the reader, about ranges and photos.
-    """
-
-    frame: str
-    paths: tuple[ScenePath, ...]
-    points_m: Array
-    points_rgb: npt.NDArray[np.uint8]
-    anchors: Mapping[str, AnchorEntry]
-    point_ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    unit: str = "m"
-    frustum_shape: tuple[float, float] = (0.6, 0.4)
-    ranges: Mapping[str, Any] = field(default_factory=dict)
-    errors: Mapping[str, Any] = field(default_factory=dict)
-    thumbnails: Mapping[str, str] = field(default_factory=dict)
-    scale_interval: Sequence[float] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def result(self) -> Trajectory:
-        return self.paths[-1].trajectory
-
-
 def view_of_result(content: Content) -> dict[str, Any]:
     """Return the data of the view of a result, as ``view_of`` does; empty where the result has no model."""
     summary, result = content.summary, content.final
@@ -121,39 +84,59 @@ def view_of_result(content: Content) -> dict[str, Any]:
         paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled, is_shown=is_result))
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
-    anchors = {id_: anchor for id_, anchor in summary.anchors.items() if anchor.position_m is not None}
     photos, pictures = result.image_names, thumbnails(content.images_path, result.image_names)
     stride, known = every_nth(len(content.ranges), MAX_NUM_RANGES), f"{count(len(pictures))} of {count(len(photos))}"
     notes = (
         f"One in {stride} ranges is drawn and listed; ranges.csv has all." if stride > 1 else "",
         f"To keep the page small, only {known} photos have a picture here." if 0 < len(pictures) < len(photos) else "",
     )
-    scene = Scene(
-        summary.frame,
-        tuple(paths),
-        content.points_m,
-        content.points_rgb,
-        anchors,
-        content.point_ids,
-        frustum_shape=content.cameras[0].half_angles if content.cameras else Scene.frustum_shape,
-        ranges=_ranges(content, result),
-        errors=errors_of_scene(content.result.read_map_errors(), summary, result, list(anchors)),
-        thumbnails=pictures,
-        scale_interval=[end / summary.scale.value for end in summary.scale.interval_95 or ()],
-        notes=notes,
-    )
-    return view_of(scene)
+    anchors, points = summary.anchors, (content.points_m, content.points_rgb, content.point_ids)
+    view = view_of(summary.frame, paths, *points, anchors=anchors, notes=notes)
+    of_result: dict[str, Any] = {
+        "ranges": _ranges(content, result) or None,
+        "thumbnails": pictures,
+        "errors": errors_of_scene(
+            content.result.read_map_errors(), summary, result, [anchor["id"] for anchor in view["anchors"]]
+        )
+        or None,
+        "scale_interval": [end / summary.scale.value for end in summary.scale.interval_95 or ()] or None,
+    }
+    for camera in [*(content.refined_cameras or content.scaled_cameras).values()][:1]:
+        focal_px = camera.mean_focal_length()
+        of_result["frustum_shape"] = camera.width / (2 * focal_px), camera.height / (2 * focal_px)
+    return view | of_result
 
 
-def view_of(scene: Scene) -> dict[str, Any]:
+def view_of(
+    frame: str,
+    paths: Sequence[ScenePath],
+    points_m: Array,
+    points_rgb: npt.NDArray[np.uint8],
+    point_ids: npt.NDArray[np.int64],
+    *,
+    anchors: Mapping[str, AnchorEntry],
+    unit: str = "m",
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
     """Return the data of the view on the page.
 
     They are what the script draws, the layers (id, name, colour and shape of the swatch, whether each is drawn at
     first), and a note for the reader.
+
+    Args:
+        frame: of all positions: "site" (z up), or any other name for the frame of a camera (y down).
+        paths: of cameras. The last one is the result; the reader chooses cameras on it.
+        points_m, points_rgb, point_ids: (m, 3) positions and colours of the map's points, and (m,) their ids in the
+            model; no ids if they are not known.
+        anchors: by id; those without a position are not shown.
+        unit: of all lengths; "m" unless nobody knows the scale.
+        notes: for the reader, about ranges and photos.
     """
-    seen = [_around(scene)]
-    if len(scene.points_m):
-        seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
+    shown = {id_: anchor for id_, anchor in anchors.items() if anchor.position_m is not None}
+    around = np.concatenate([*(path.trajectory.centers for path in paths), *([a.position_m] for a in shown.values())])
+    seen = [around]
+    if len(points_m):
+        seen.append(np.quantile(points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
     corners = np.concatenate(seen)
     low, high = corners.min(axis=0), corners.max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
@@ -162,37 +145,37 @@ def view_of(scene: Scene) -> dict[str, Any]:
     step = 10.0 ** math.floor(math.log10(radius))
     origin_m = step * np.round((low + high) / 2 / step)
     low, high = low - origin_m, high - origin_m
-    ground = float(low[2]) if scene.frame == "site" else float(high[1])
-    points, anchors = _points(scene, origin_m), [_anchor(*each, origin_m) for each in scene.anchors.items()]
+    ground, result = float(low[2]) if frame == "site" else float(high[1]), paths[-1]
+    chosen, of_anchors = _chosen_points(points_m, around), [_anchor(*each, origin_m) for each in shown.items()]
+    points = _points(points_m[chosen] - origin_m, points_rgb[chosen], point_ids[chosen] if len(point_ids) else None)
     layers = [("points", "Map points", "map", "dots", True)] if points else []
     layers += [
-        (path.id, path.name, path.color, "line" if path.has_orientations else "dashed", path.is_shown)
-        for path in scene.paths
+        (path.id, path.name, path.color, "line" if path.has_orientations else "dashed", path.is_shown) for path in paths
     ]
-    layers += [("anchors", "Anchors", "anchor", "triangle", True)] if anchors else []
-    num_left_out = len(scene.points_m) - (points["num"] if points else 0)
+    layers += [("anchors", "Anchors", "anchor", "triangle", True)] if shown else []
+    num_left_out = len(points_m) - len(chosen)
     note = (
         "Drag to turn, wheel or pinch to zoom, right drag or two fingers to move; click a camera for its photo.",
         f"{count(num_left_out)} points are not drawn, because they are far away or too many." if num_left_out else "",
-        *scene.notes,
-        "Ellipsoids around the anchors are their 95 % regions, at true size." if anchors else "",
+        *notes,
+        "Ellipsoids around the anchors are their 95 % regions, at true size." if shown else "",
     )
     return {
-        "unit": scene.unit,
-        "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
+        "unit": unit,
+        "up": [0, 0, 1] if frame == "site" else [0, -1, 0],
         "origin": origin_m.tolist(),
         "box": {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground},
-        "paths": [_path(path, origin_m) for path in scene.paths],
+        "paths": [_path(path, origin_m) for path in paths],
         "points": points or None,
-        "anchors": anchors,
-        "ranges": scene.ranges or None,
-        "frustum_size": _frustum_size(scene.result, radius),
-        "frustum_shape": scene.frustum_shape,
-        "thumbnails": scene.thumbnails,
-        "errors": scene.errors or None,
-        "scale_interval": scene.scale_interval or None,
+        "anchors": of_anchors,
+        "ranges": None,
+        "frustum_size": _frustum_size(result.trajectory, radius),
+        "frustum_shape": (0.6, 0.4),
+        "thumbnails": {},
+        "errors": None,
+        "scale_interval": None,
         "layers": [*layers, ("grid", "Grid", "muted", "box", True)],
-        "num_photos": len(scene.result) if scene.paths[-1].has_orientations else 0,
+        "num_photos": len(result.trajectory) if result.has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
 
@@ -211,42 +194,35 @@ def _path(path: ScenePath, origin_m: Array) -> dict[str, Any]:
     }
 
 
-def _points(scene: Scene, origin_m: Array) -> dict[str, Any]:
-    chosen = _chosen_points(scene)
-    if len(chosen) == 0:
+def _points(points: Array, colors: npt.NDArray[np.uint8], ids: npt.NDArray[np.int64] | None) -> dict[str, Any]:
+    if len(points) == 0:
         return {}
-    points = scene.points_m[chosen] - origin_m
     origin, extent = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
     return {
         "num": len(points),
         "origin": origin.tolist(),
         "extent": extent,
         "steps": pack(np.round((points - origin) / extent * NUM_STEPS), "uint16"),
-        "colors": pack(scene.points_rgb[chosen], "uint8"),
-        "ids": pack(scene.point_ids[chosen], "int32") if len(scene.point_ids) else None,
+        "colors": pack(colors, "uint8"),
+        "ids": None if ids is None else pack(ids, "int32"),
     }
 
 
-def _chosen_points(scene: Scene) -> npt.NDArray[np.int64]:
+def _chosen_points(points: Array, around: Array) -> npt.NDArray[np.int64]:
     """Return the indices of the points to draw, in random order.
 
     Points far away from all others are left out: they would make the box, and with it the steps of all points, coarse.
+
+    Args:
+        points: (m, 3) of the map. around: (n, 3) positions of cameras and anchors.
     """
-    points = scene.points_m
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     low, high = np.quantile(points, [_FAR_QUANTILE, 1 - _FAR_QUANTILE], axis=0)
-    around = _around(scene)
     low, high = np.minimum(low, around.min(axis=0)), np.maximum(high, around.max(axis=0))
     margin = 0.5 * (high - low).max()
     inside = np.flatnonzero(np.all((points >= low - margin) & (points <= high + margin), axis=1))
     return np.random.default_rng(0).permutation(inside)[:MAX_NUM_POINTS]
-
-
-def _around(scene: Scene) -> Array:
-    """Return the positions of cameras and anchors, (n, 3)."""
-    anchors = [[anchor.position_m] for anchor in scene.anchors.values()]
-    return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
 
 
 def _frustum_size(path: Trajectory, radius: float) -> float:

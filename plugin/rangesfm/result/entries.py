@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
@@ -447,17 +447,14 @@ class GeoreferenceEntry(Record):
         return Georeference(self.lat_deg, self.lon_deg, self.height_m, self.crs)
 
 
-class _Table(Record):
-    """A table of a survey file as recorded. Classes name only the keys that are read again."""
-
-    model_config = ConfigDict(extra="allow")
+# Tables of a survey file as recorded; the classes name only the keys that are read again.
 
 
-class ImageSettings(_Table):
+class ImageSettings(Record, extra="allow"):
     path: Text | None
 
 
-class RangesSettings(_Table):
+class RangesSettings(Record, extra="allow"):
     max_interpolation_gap_s: Number
     max_time_difference_s: Number
 
@@ -468,7 +465,7 @@ class RangesSettings(_Table):
         )
 
 
-class AnchorSettings(_Table):
+class AnchorSettings(Record, extra="allow"):
     path: Text | None
     frame: Text | None
     crs: Text | None
@@ -476,17 +473,17 @@ class AnchorSettings(_Table):
     unit: Text | None = None
 
 
-class TagSettings(_Table):
+class TagSettings(Record, extra="allow"):
     tag_in_cam_m: Vector
     lever_arms_m: dict[Text, Vector]
 
 
-class ReportSettings(_Table):
+class ReportSettings(Record, extra="allow"):
     title: Text | None = None
     by: Text | None = None
 
 
-class Settings(_Table):
+class Settings(Record, extra="allow"):
     """The settings of the survey as the run had them, by table and key."""
 
     images: ImageSettings
