@@ -50,8 +50,9 @@ def test_line_numbers_count_comments_and_blank_lines(tmp_path: Path) -> None:
         b" a , b \n 1 ,\t2\n3,4",
         b'"a","b"\n"1","2"\n3,4\n',
         "a,b\n1,2\n3,4\n".encode("utf-16"),
+        b"a,b\n1,2\na,b\n3,4\n",
     ],
-    ids=["byte order mark", "CRLF", "CR and no last line end", "blanks around cells", "quotes", "UTF-16"],
+    ids=["byte order mark", "CRLF", "CR and no last line end", "blanks around cells", "quotes", "UTF-16", "two files"],
 )
 def test_the_same_table_in_another_dress(tmp_path: Path, content: bytes) -> None:
     table = read_table(write(tmp_path, content), ["a", "b"])

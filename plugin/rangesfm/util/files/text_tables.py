@@ -210,7 +210,7 @@ def read_table(
     lines: list[int] = []
     columns: dict[str, list[str]] = {name: [] for name in wanted}
     for line, row in enumerate(body.split("\n"), header_line + 1):
-        if not _has_content(row):
+        if not _has_content(row) or row == header_row:  # in joined files the header row is repeated
             continue
         cells = _split_row(row, separator, path, line)
         if len(cells) != len(names):

@@ -96,6 +96,8 @@ LONG = {
     ),
     "tabs and text before": "Logger v2\nstarted by hand\n"
     + lines("Time\tAddress\tRange\tRxPower", lambda t, a, r: f"{t:.3f}\t{a}\t{r:.3f}\t-70.1"),
+    "spreadsheet filled up with empty cells": ";;;;\nHall 3;12.03.2026;;;\n"
+    + lines(";Anchor;Time [s];Range [m];Remark", lambda t, a, r: f";{a};{t:.3f};{r:.3f};".replace(".", ",")),
     "date and time": lines("Date,Time,AnchorID,Dist", lambda t, a, r: f"2026-01-31,{clock(t + 36000)},{a},{r:.3f}"),
     "names in a comment": lines("# time anchor range", lambda t, a, r: f"{t:.3f} {a} {r:.3f}"),
     "no names": lines(None, lambda t, a, r: f"  {t:.16e}\t  {2:.16e}\t  {int(NUM[a]):.16e}\t  {r:.16e}\t").replace(
@@ -411,6 +413,13 @@ def test_column_that_is_missing_is_asked_for(tmp_path: Path) -> None:
         read_ranges(path)
     assert "not sure: no column seems to be the timestamp" in caught.value.advice
     assert caught.value.advice[-1] == "no other column of numbers can be the timestamp, which a log needs"
+
+
+def test_the_cell_that_keeps_a_column_from_being_numbers_is_shown(tmp_path: Path) -> None:
+    path = write(tmp_path, lines("time;anchor;range", lambda t, a, r: f"{t:.3f};{a};{r:.3f}") + "30.1;A0;02. Mar\n")
+    with pytest.raises(InputError, match="columns are not known") as caught:
+        read_ranges(path)
+    assert "range (text, '02. Mar')" in caught.value.advice[0]
 
 
 def test_commands_name_the_columns_that_may_be_what_is_missing(

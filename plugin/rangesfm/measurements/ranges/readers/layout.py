@@ -190,7 +190,10 @@ class ColumnSample:
     def __str__(self) -> str:
         if self.kind == "numbers" and len(self.numbers):
             return f"{self.name} ({self.numbers.min():.10g} to {self.numbers.max():.10g})"
-        return f"{self.name} ({self.kind}{'' if self.kind == 'nothing' else f', {self.cells[0]!r}'})"
+        if self.kind == "nothing":
+            return f"{self.name} (nothing)"
+        shown = next((cell for cell in self.filled if not _NUMBER.fullmatch(cell)), self.filled[0])
+        return f"{self.name} ({self.kind}, {shown!r})"
 
 
 @dataclass(frozen=True)
@@ -265,6 +268,7 @@ def find_layout(path: Path, separator: str = "") -> Layout | None:
         rows[first] = rows[first][:-1]
     while separator == " " and _is_title(rows[first:], num):
         first += 1
+    first += _num_padded(rows[first:], num)
     body = [row for row in rows[first:] if len(row) == num]
     names, num_skipped = None, content[first][0] - 1
     below = body[1:] if len(rows[first]) == num else body
@@ -384,6 +388,15 @@ def _is_title(rows: list[list[str]], num: int) -> bool:
         and _is_second_header(body[1], body[2:])
         and not {word for cell in body[1] for word in words_of(cell)} <= _UNITS
     )
+
+
+def _num_padded(rows: list[list[str]], num: int) -> int:
+    """Return the number of lines of title above the header, which spreadsheets fill up with empty cells."""
+    for k, row in enumerate(rows[:_MAX_NUM_WORDS] if "" in rows[0] else ()):
+        has_more = k == 0 or (len(row) == num and row.count("") < rows[0].count(""))
+        if has_more and _is_header(row, [below for below in rows[k + 1 :] if len(below) == num]):
+            return k
+    return 0
 
 
 def _unique(names: list[str], num: int) -> list[str]:
