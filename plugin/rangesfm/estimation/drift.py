@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +14,7 @@ from rangesfm.colmap.transform import transform
 from rangesfm.estimation.free_fit import GraphSolution, KeyframeGraph, local_scales, solve_graph, with_gradient
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.vision_information import (
-    NO_LOOPS,
-    LoopPoses,
+    Loop,
     Observations,
     VisionInformation,
     costs_of_points,
@@ -94,7 +93,9 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
     return _moved(problem, rays, graph, _solve_precisely(graph, problem, graph.start))
 
 
-def close_in_graph(problem: MapProblem, known: MapProblem, rays: Observations, loops: LoopPoses) -> Straightened | None:
+def close_in_graph(
+    problem: MapProblem, known: MapProblem, rays: Observations, loops: Sequence[Loop]
+) -> Straightened | None:
     """Close loops of a model that was refined, in place; None where that bends it by no more than photos just see.
 
     A map that bends leaves its ranges on the way, and would lose them as outliers. So their noise is estimated anew, as
@@ -102,7 +103,7 @@ def close_in_graph(problem: MapProblem, known: MapProblem, rays: Observations, l
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
-        rays: all observations of the photos. loops: by indices in ``problem.frame_ids``.
+        rays: all observations of the photos. loops: of its keyframes.
     """
     graph = _graph(known, rays, known.start.blocks, loops)
     # A bundle adjustment follows in any case. More precisely, the graph takes tens of steps along weak modes.
@@ -128,7 +129,7 @@ def _moved(problem: MapProblem, rays: Observations, graph: KeyframeGraph, fit: G
 
 
 def _graph(
-    problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array], loops: LoopPoses = NO_LOOPS
+    problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array], loops: Sequence[Loop] = ()
 ) -> KeyframeGraph:
     """Set up the keyframe graph of the current model.
 
@@ -142,8 +143,7 @@ def _graph(
     if problem.is_refined:
         vision = with_gradient(vision, photo_gradient(seen, poses))
     own = {name: at for name, at in blocks.items() if name[0] != "mark"}  # here marks are where their rays meet
-    vision = vision.with_loops(loops) if len(loops.frame) else vision
-    return KeyframeGraph(vision, problem.kinds, problem.held_frame, own)
+    return KeyframeGraph(vision.with_loops(loops, problem.frame_ids), problem.kinds, problem.held_frame, own)
 
 
 def _move(problem: MapProblem, rays: Observations, vision: VisionInformation, after: Poses) -> None:

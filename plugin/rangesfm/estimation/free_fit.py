@@ -239,10 +239,9 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     """
     r, k = vision.reference, vision.frame
     turn, shift = relative_poses(poses, r, k)
-    turn_before, shift_before = vision.measured()
-    scale = _local_scale(vision, shift, shift_before)[r][:, None]
-    angles = Rotation.from_matrix(np.swapaxes(turn_before, 1, 2) @ turn).as_rotvec()
-    residuals = np.concatenate([angles, shift / scale - shift_before], axis=1).ravel() + vision.from_optimum
+    scale = _local_scale(vision, shift)[r][:, None]
+    angles = Rotation.from_matrix(np.swapaxes(vision.turn, 1, 2) @ turn).as_rotvec()
+    residuals = np.concatenate([angles, shift / scale - vision.shift], axis=1).ravel() + vision.from_optimum
     # d log(Exp(a) Exp(d)) to first order in a: Solà et al., "A micro Lie theory", eq. 144.
     spread = np.eye(3) + 0.5 * cross_matrices(angles)
     to_reference, to_frame = np.zeros((2, len(r), 6, 6))
@@ -256,11 +255,11 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     return residuals, sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
 
 
-def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:
+def _local_scale(vision: VisionInformation, shift: Array) -> Array:
     """Return the (n,) growth of the map around each keyframe, where loops do not count."""
     n, near = len(vision.origin), slice(vision.num_from_points)
     now = np.bincount(vision.reference[near], np.sum(shift[near] ** 2, axis=1), minlength=n)
-    before = np.bincount(vision.reference[near], np.sum(shift_before[near] ** 2, axis=1), minlength=n)
+    before = np.bincount(vision.reference[near], np.sum(vision.shift[near] ** 2, axis=1), minlength=n)
     least = rounding_of(vision.origin.centers) ** 2  # keyframes in one place have no scale
     known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
@@ -268,9 +267,7 @@ def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -
 
 def local_scales(vision: VisionInformation, poses: Poses) -> Array:
     """Return the (n,) scale of the map around each keyframe relative to the origin, from its neighbours."""
-    _, shift = relative_poses(poses, vision.reference, vision.frame)
-    _, shift_before = vision.measured()
-    return _local_scale(vision, shift, shift_before)
+    return _local_scale(vision, relative_poses(poses, vision.reference, vision.frame)[1])
 
 
 def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Indices, Mask]) -> NestedFactor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.estimation.drift import SAME_NOISE, Straightened, close_in_graph, straighten, straighten_again
 from rangesfm.estimation.map_problem import MapProblem, equations_of
 from rangesfm.estimation.vision_information import (
-    LoopPoses,
+    Loop,
     Observations,
     misplaced_points,
     model_observations,
@@ -40,9 +40,6 @@ from rangesfm.util.geometry.poses import Poses, model_poses
 _MAX_NUM_ROUNDS = 3
 # Largest movement of a keyframe left at the end, as a share of the smallest standard deviation of a measurement.
 _MAX_LAST_MOVEMENT = 0.01
-
-MergeTracks = Callable[[pycolmap.Reconstruction], None]
-"""Makes one point of those that two passes saw apart, in place."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +123,8 @@ def _without_misplaced(problem: MapProblem) -> tuple[MapProblem, BundleAdjustmen
 def refine_with_loops(
     problem: MapProblem,
     known: MapProblem,
-    loops: LoopPoses,
-    merge_tracks: MergeTracks,
+    loops: Sequence[Loop],
+    merge_tracks: Callable[[pycolmap.Reconstruction], None],
     *,
     with_equations: bool = True,
 ) -> MapAtRest | None:
@@ -135,17 +132,12 @@ def refine_with_loops(
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
-        loops: measured relative poses, by ids of frames in place of indices.
+        loops: of its keyframes.
+        merge_tracks: makes one point of those that two passes saw apart, in place.
         with_equations: as for ``refine``.
     """
-    place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
-    reference, frame = (
-        np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
-        for ids in (loops.reference, loops.frame)
-    )
     seen, _, rays = _without_misplaced(problem)
-    at_indices = replace(loops, reference=reference, frame=frame)
-    if (closed := close_in_graph(seen, seen.like(known), rays, at_indices)) is None:
+    if (closed := close_in_graph(seen, seen.like(known), rays, loops)) is None:
         return None
     merge_tracks(problem.metric)
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do

@@ -7,7 +7,7 @@ common turn or shift costs nothing, and neither does a common scale, which the p
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,24 +77,20 @@ class Observations:
 
 
 @dataclass(frozen=True)
-class LoopPoses:
-    """Measured poses of l keyframes relative to keyframes of another pass, in whose maps they were found again.
+class Loop:
+    """The measured pose of a keyframe relative to a keyframe of another pass, in whose surroundings it was found again.
 
     Attributes:
-        reference, frame: (l,) indices of the keyframe whose surroundings are known, and of the one found in them.
-        turn, shift: (l, 3, 3), (l, 3) pose of ``frame`` in the frame of ``reference``.
-        information: (l, 6, 6) on the turn in the frame of ``frame`` and the shift.
+        reference, frame: ids of the frames: of the one whose surroundings are known, and of the one found in them.
+        turn, shift: (3, 3), (3,) pose of ``frame`` in the frame of ``reference``.
+        information: (6, 6) on the turn in the frame of ``frame`` and the shift.
     """
 
-    reference: Indices
-    frame: Indices
+    reference: int
+    frame: int
     turn: Array
     shift: Array
     information: Array
-
-
-_NONE = np.zeros(0, dtype=np.int64)
-NO_LOOPS = LoopPoses(_NONE, _NONE, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
 
 
 @dataclass(frozen=True)
@@ -104,42 +100,43 @@ class VisionInformation:
     Attributes:
         origin: the poses of linearisation.
         reference, frame: (u,) pose of keyframe ``frame`` relative to keyframe ``reference``.
+        turn, shift: (u, 3, 3), (u, 3) these poses at the origin, and of loops as they were measured.
         matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
         from_optimum: (6 u,) relative poses at the origin, minus those at which the photos fit best.
-        loops: the last of the relative poses, which are not as at the origin.
+        num_from_points: number of relative poses that are not loops, which come last.
     """
 
     origin: Poses
     reference: Indices
     frame: Indices
+    turn: Array
+    shift: Array
     matrix: sparse.bsr_array
     from_optimum: Array
-    loops: LoopPoses = NO_LOOPS
+    num_from_points: int
 
-    def with_loops(self, loops: LoopPoses) -> VisionInformation:
-        """Return a copy with further relative poses."""
-        starts = np.arange(len(loops.information) + 1)
-        size = 6 * len(loops.information)
-        further = sparse.bsr_array((loops.information, starts[:-1], starts), shape=(size, size))
-        return VisionInformation(
-            self.origin,
-            np.concatenate([self.reference, loops.reference]),
-            np.concatenate([self.frame, loops.frame]),
-            sparse.block_diag([self.matrix, further], format="bsr"),
-            np.concatenate([self.from_optimum, np.zeros(size)]),
-            loops,
+    def with_loops(self, loops: Sequence[Loop], frame_ids: Indices) -> VisionInformation:
+        """Return a copy with further relative poses.
+
+        Args:
+            frame_ids: of the keyframes.
+        """
+        if not loops:
+            return self
+        place = {frame_id: k for k, frame_id in enumerate(frame_ids.tolist())}
+        starts = np.arange(len(loops) + 1)
+        size = 6 * len(loops)
+        information = np.array([loop.information for loop in loops])
+        further = sparse.bsr_array((information, starts[:-1], starts), shape=(size, size))
+        return replace(
+            self,
+            reference=np.append(self.reference, [place[loop.reference] for loop in loops]),
+            frame=np.append(self.frame, [place[loop.frame] for loop in loops]),
+            turn=np.concatenate([self.turn, [loop.turn for loop in loops]]),
+            shift=np.concatenate([self.shift, [loop.shift for loop in loops]]),
+            matrix=sparse.block_diag([self.matrix, further], format="bsr"),
+            from_optimum=np.append(self.from_optimum, np.zeros(size)),
         )
-
-    @property
-    def num_from_points(self) -> int:
-        """Return the number of relative poses that are not loops."""
-        return len(self.reference) - len(self.loops.reference)
-
-    def measured(self) -> tuple[Array, Array]:
-        """Return the (u, 3, 3) turns and (u, 3) shifts at the origin, and of loops as they were measured."""
-        turn, shift = relative_poses(self.origin, self.reference, self.frame)
-        turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
-        return turn, shift
 
 
 def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:
@@ -267,7 +264,8 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     starts = np.searchsorted(place[: len(key)], np.arange(len(pairs) + 1))
     size = 6 * len(pairs)
     matrix = sparse.bsr_array((values / share, place[len(key) :], starts), shape=(size, size))
-    return VisionInformation(poses, pairs // n, pairs % n, matrix, np.zeros(size))
+    turn, shift = relative_poses(poses, pairs // n, pairs % n)
+    return VisionInformation(poses, pairs // n, pairs % n, turn, shift, matrix, np.zeros(size), len(pairs))
 
 
 def photo_gradient(observations: Observations, poses: Poses) -> Array:

@@ -6,34 +6,27 @@ its photos alone.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
-from rangesfm.estimation.refinement import MapAtRest, MergeTracks, joint_errors, refine, refine_with_loops
-from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.vision_information import Loop
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.refine_map import refine_closed_map
 from rangesfm.progress import Journal, Progress
 from rangesfm.result.result_folder import RESULT_NAMES
-from rangesfm.sfm.loop_database import LoopMatching, Pair, has_closed_loops
-from rangesfm.sfm.loops.loop_closure import LoopClosure
+from rangesfm.sfm.loop_database import LoopMatching, has_closed_loops
 from rangesfm.sfm.loops.loop_finder import LoopFinder
-from rangesfm.sfm.loops.merge import merge_tracks
-from rangesfm.sfm.loops.resection import Loop
-from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds, find_in
+from rangesfm.sfm.loops.rounds import MAX_NUM_ROUNDS, LoopClosure, find_loops
 from rangesfm.sfm.matching import matching_options
-from rangesfm.sfm.photos_alike import pairs_alike
 from rangesfm.sfm.steps import DATABASE_NAME, MODELS_NAME, Workspace
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
@@ -41,8 +34,8 @@ from rangesfm.util.files.output_folder import OutputFolder, sole_writer
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
+_Map = TypeVar("_Map")
+"""A refined map whose loops can be closed."""
 
 
 def loop_matching(survey: Survey, progress: Progress, output: OutputFolder) -> LoopMatching | None:
@@ -76,21 +69,26 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
             if run.survey.images.model is not None:
                 raise InputError(why_not, run.survey.mapper.database_path)
             return metric
-        last, tried = close_in_rounds(_MetricMap(run.survey, run.journal, matching, run, metric))
-        last.keep(tried)
+
+        def close(
+            before: MetricResult, found: Sequence[Loop], is_last: bool
+        ) -> tuple[MetricResult, Sequence[str]] | None:
+            del is_last  # its covariance is that of the result
+            closed = refine_closed_map(run, before, found, matching.merge_tracks)
+            return None if closed is None or closed.refined is None else (closed, closed.refined.why_broken)
+
+        last, loops = _close_in_rounds(run.journal, matching, metric, _finder_in, close, by_likeness=False)
         matching.publish(output)
-        closed, contradicted = (
-            tuple((last.model.image(first).name, last.model.image(second).name) for first, second in sorted(pairs))
-            for pairs in (tried.closed, tried.contradicted)
-        )
-        before, after = metric.kept, last.metric.refined
-        assert after is not None, "a refined map"
-        path = metric.trajectory.as_in(before.model)
-        loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path)
-        run.journal.warn(*filter(None, [loops.warning]))
+        if loops.contradicted:
+            first, second = (last.final.image(image_id).name for image_id in min(loops.contradicted))
+            run.journal.warn(
+                f"{len(loops.contradicted)} pairs of photos match but contradict the measurements, and are not used;"
+                f" the first is {first} and {second}, and loops.csv has all"
+            )
+        assert last.refined is not None, "a refined map"
         # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
-        summary = replace(after.summary, bend_m=before.summary.bend_m)
-        return replace(last.metric, refined=replace(after, summary=summary, loops=loops))
+        summary = replace(last.refined.summary, bend_m=metric.kept.summary.bend_m)
+        return replace(last, refined=replace(last.refined, summary=summary, loops=loops))
 
 
 def close_loops_of_models(
@@ -110,20 +108,11 @@ def close_loops_of_models(
         if (matching := loop_matching(survey, journal.progress, output)) is None:
             return models[0]
         try:
-            if why_not := matching.why_unfit(models[0]):
-                raise GeometryError(why_not)
-            with journal.stage("refinement"):
-                path = trajectory_from_reconstruction(models[0])
-                at_rest = refine(_problem(survey, path, models[0], is_refined=False))
-            start = _UnscaledMap(survey, journal, matching, path, at_rest, _errors_alone(at_rest))
-            if start.finder is None:
-                raise GeometryError("the covariance of the poses is not known")
-            last, tried = close_in_rounds(start)
+            model, tried = _closed_by_photos(survey, journal, matching, models[0])
         except (GeometryError, SolverError) as error:
             journal.warn(f"loops are not closed: {error}")
             matching.discard()
             return models[0]
-        last.keep(tried)
         matching.keep_closed()
         wrong = f"; {len(tried.contradicted)} contradict the model and were not used" if tried.contradicted else ""
         journal.progress.message(
@@ -135,151 +124,98 @@ def close_loops_of_models(
             return models[0]
         staged = matching.folder / "model"
         staged.mkdir(exist_ok=True)
-        write_binary_model(last.model, staged)
+        write_binary_model(model, staged)
         place = output.path / MODELS_NAME / "0"
         matching.publish_with(output, {place: staged}, [output.path / name for name in RESULT_NAMES])
-        return last.model
+        return model
 
 
-@dataclass(frozen=True)
-class _MatchedMap(ABC):
-    """A map at rest with the matching of its photos."""
+def _close_in_rounds(
+    journal: Journal,
+    matching: LoopMatching,
+    refined: _Map,
+    finder_in: Callable[[_Map], LoopFinder],
+    close: Callable[[_Map, Sequence[Loop], bool], tuple[_Map, Sequence[str]] | None],
+    *,
+    by_likeness: bool,
+) -> tuple[_Map, LoopClosure]:
+    """Close the loops of a map, and return the last map with the pairs of all rounds.
 
-    survey: Survey
-    journal: Journal
-    matching: LoopMatching
+    The test of a loop takes the errors of the map for small. A map that is bent by metres contradicts true loops until
+    others have straightened it. So where loops contradict the map, another round tests them again in the next map. If
+    they are few, this only tells which of them still do; otherwise more are proposed and closed. It ends where nothing
+    new is found. The matches of closed loops stay in the database, and what was tried in vain.
 
-    @property
-    @abstractmethod
-    def model(self) -> pycolmap.Reconstruction:
-        """The map."""
-
-    @property
-    @abstractmethod
-    def finder(self) -> LoopFinder | None:
-        """Of its loops; None if the errors of its poses are not known."""
-
-    @property
-    @abstractmethod
-    def why_broken(self) -> tuple[str, ...]:
-        """What shows that the map is broken; empty if nothing does."""
-
-    @abstractmethod
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> Self | None:
-        """Return the map refined with loops, relative poses by ids of frames; None if they are closed in it.
-
-        Args:
-            is_last: whether no more loops are to be proposed in that map.
-        """
-
-    def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
-        """Return pairs of photos that look alike; arguments as of ``find_in``."""
-        del known
-        return []
-
-    def neighbours(self) -> Mapping[int, Set[int]]:
-        """Return photos that tell the same; as of ``find_in``."""
-        return {}
-
-    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
-        if self.finder is None:
-            return [], tried
-        with self.journal.stage("loops"):
-            matching = self.matching
-            return find_in(self.finder, matching.match, matching.known(), tried, self.alike, self.neighbours())
-
-    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> Self | None:
-        self.keep(tried)
-        assert self.finder is not None, "it has found the loops"
-
-        def merge(model: pycolmap.Reconstruction) -> None:
-            with colmap_log(self.matching.log):
-                merge_tracks(model, self.matching.database, seed=self.survey.output.seed)
-
-        with self.journal.stage("refinement"):
-            closed = self.with_loops(self.finder.relative_poses(loops), merge, is_last=not tried.promise_more)
-        if closed is not None and (why := closed.why_broken):
-            self.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
-            return None
-        return closed
-
-    def keep(self, tried: TriedPairs) -> None:
-        """Keep the matches of closed loops alone in the database, and what was tried in vain."""
-        self.matching.keep(tried.proposed, tried.verified, tried.closed)
-
-
-@dataclass(frozen=True)
-class _MetricMap(_MatchedMap):
-    """A refined map of a survey."""
-
-    run: SurveyRun
-    metric: MetricResult
-
-    @property
-    def model(self) -> pycolmap.Reconstruction:
-        return self.metric.final
-
-    @cached_property
-    def finder(self) -> LoopFinder | None:
-        refined, path = self.metric.kept, self.metric.trajectory
-        if refined is None or not refined.summary.covariance.are_known:
-            return None
-        errors = refined.summary.covariance
-        seed = self.survey.output.seed
-        return LoopFinder.in_refined_map(refined.model, path, errors, refined.summary.pixel_stddev, seed)
-
-    @property
-    def why_broken(self) -> tuple[str, ...]:
-        return () if self.metric.refined is None else self.metric.refined.why_broken
-
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> _MetricMap | None:
-        del is_last
-        closed = refine_closed_map(self.run, self.metric, loops, merge)
-        return None if closed is None else replace(self, metric=closed)
-
-
-@dataclass(frozen=True)
-class _UnscaledMap(_MatchedMap):
-    """The model of a mapper, whose photos are matched as far as they look alike, too.
-
-    Attributes:
-        trajectory: of its keyframes. at_rest: the model, with no measurements but its photos.
-        errors: of its poses; of the last map those before its loops were closed, which were larger.
+    Args:
+        refined: the map. finder_in: of the loops of a map.
+        close: returns a map refined with loops, and what shows that it broke; None if they are closed in the map. Its
+            last argument says whether no more loops are to be proposed in the map that it returns.
+        by_likeness: as for ``find_loops``.
     """
+    tried = LoopClosure(finder_in(refined).path)
+    for _ in range(MAX_NUM_ROUNDS):
+        if not (finder := finder_in(refined)).map_errors.are_known:
+            break
+        may_close = tried.promises_more
+        with journal.stage("loops"):
+            loops, tried = find_loops(finder, matching, tried, by_likeness=by_likeness)
+        if not (loops and may_close):
+            break
+        closed = replace(tried, closed=tried.closed.union(loops))
+        matching.keep(closed.proposed, closed.verified, closed.closed)
+        with journal.stage("refinement"):
+            after = close(refined, list(loops.values()), not closed.promises_more)
+        if after is None:
+            break
+        if after[1]:
+            journal.warn(f"loops are left open, because the map broke: {'; '.join(after[1])}")
+            break
+        refined, tried = after[0], closed
+        if not tried.contradicted:
+            break
+    matching.keep(tried.proposed, tried.verified, tried.closed)
+    return refined, tried
 
-    trajectory: Trajectory
-    at_rest: MapAtRest
-    errors: MapErrors
 
-    @property
-    def model(self) -> pycolmap.Reconstruction:
-        return self.at_rest.problem.metric
+def _finder_in(metric: MetricResult) -> LoopFinder:
+    assert metric.kept is not None, "a refined map"
+    model, summary = metric.kept.model, metric.kept.summary
+    return LoopFinder(model, metric.trajectory.as_in(model), summary.covariance, summary.pixel_stddev)
 
-    @cached_property
-    def finder(self) -> LoopFinder | None:
-        if not self.errors.are_known:
-            return None
-        pixel_stddev, seed = self.at_rest.pixel_stddev, self.survey.output.seed
-        return LoopFinder.in_refined_map(self.model, self.trajectory, self.errors, pixel_stddev, seed)
 
-    @property
-    def why_broken(self) -> tuple[str, ...]:
-        errors = point_errors(self.model)
-        return () if errors.fit else (errors.apart("the refined map"),)
+def _closed_by_photos(
+    survey: Survey, journal: Journal, matching: LoopMatching, model: pycolmap.Reconstruction
+) -> tuple[pycolmap.Reconstruction, LoopClosure]:
+    """Close the loops of a mapper's model, and return it at rest with the pairs of all rounds.
 
-    def with_loops(self, loops: LoopPoses, merge: MergeTracks, *, is_last: bool) -> _UnscaledMap | None:
-        problem = _problem(self.survey, self.trajectory, self.model, is_refined=True)
-        rest = refine_with_loops(problem, problem, loops, merge, with_equations=not is_last)
+    Raises:
+        GeometryError: the photos do not belong to the model, or do not determine it. SolverError: the solver failed.
+    """
+    if why_not := matching.why_unfit(model):
+        raise GeometryError(why_not)
+    path = trajectory_from_reconstruction(model)
+
+    def finder_in(rest: MapAtRest, errors: MapErrors) -> LoopFinder:
+        closed = rest.problem.metric
+        return LoopFinder(closed, path.as_in(closed), errors, rest.pixel_stddev)
+
+    def close(before: LoopFinder, loops: Sequence[Loop], is_last: bool) -> tuple[LoopFinder, Sequence[str]] | None:
+        problem = _problem(survey, path, before.model, is_refined=True)
+        rest = refine_with_loops(problem, problem, loops, matching.merge_tracks, with_equations=not is_last)
         if rest is None:
             return None
-        return replace(self, at_rest=rest, errors=self.errors if is_last else _errors_alone(rest))
+        errors = point_errors(rest.problem.metric)
+        # Those of the last map before its loops were closed were larger.
+        after = finder_in(rest, before.map_errors if is_last else _errors_alone(rest))
+        return after, () if errors.fit else (errors.apart("the refined map"),)
 
-    def neighbours(self) -> Mapping[int, Set[int]]:
-        return self.matching.known()
-
-    def alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
-        matching = self.matching
-        return pairs_alike(matching.database, known, matching.log, max_num=1, seed=self.survey.output.seed)
+    with journal.stage("refinement"):
+        rest = refine(_problem(survey, path, model, is_refined=False))
+    start = finder_in(rest, _errors_alone(rest))
+    if not start.map_errors.are_known:
+        raise GeometryError("the covariance of the poses is not known")
+    last, tried = _close_in_rounds(journal, matching, start, lambda finder: finder, close, by_likeness=True)
+    return last.model, tried
 
 
 def _errors_alone(at_rest: MapAtRest) -> MapErrors:

@@ -24,8 +24,8 @@ from rangesfm.pipeline.metric_result import ModelVerdict
 from rangesfm.pipeline.place_ranges import place_ranges
 from rangesfm.sfm.incremental_mapping import adjust_whole
 from rangesfm.sfm.loop_database import Pair
+from rangesfm.sfm.loops.loop_finder import MAX_CHANCE
 from rangesfm.sfm.loops.model_ties import Tie, find_tie
-from rangesfm.sfm.loops.resection import MAX_CHANCE
 from rangesfm.sfm.loops.rounds import MAX_NUM_PAIRS
 from rangesfm.sfm.mapping import mapping_options
 from rangesfm.sfm.photos_alike import pairs_alike

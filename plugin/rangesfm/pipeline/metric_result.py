@@ -18,7 +18,7 @@ from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.sfm.loops.loop_closure import LoopClosure
+from rangesfm.sfm.loops.rounds import LoopClosure
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.util.geometry.georeference import Georeference

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,8 @@ from rangesfm.estimation.drift import bend
 from rangesfm.estimation.map_posterior import errors_at_estimate, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import by_photos
-from rangesfm.estimation.refinement import MapAtRest, MergeTracks, joint_errors, refine, refine_with_loops
-from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.vision_information import Loop
 from rangesfm.estimation.with_ranges import refined_ranges, summarize
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, beside_others, join_kinds, tested_kinds
 from rangesfm.measurements.kind import MapState
@@ -46,12 +47,12 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
 
 
 def refine_closed_map(
-    run: SurveyRun, metric: MetricResult, loops: LoopPoses, merge_tracks: MergeTracks
+    run: SurveyRun, metric: MetricResult, loops: Sequence[Loop], merge_tracks: Callable[[pycolmap.Reconstruction], None]
 ) -> MetricResult | None:
     """Close the loops of a refined map, and refine it again; None if they are closed in it.
 
     Args:
-        metric: with the refined map. loops: measured relative poses, by ids of frames.
+        metric: with the refined map. loops, merge_tracks: as for ``refine_with_loops``.
 
     Raises:
         SolverError: as for ``refine_map``.

@@ -151,8 +151,8 @@ def _loops(found: MetricResult) -> entries.LoopsEntry | None:
     if found.refined is None or (loops := found.refined.loops) is None:
         return None
     return entries.LoopsEntry(
-        num_proposed=loops.num_proposed,
-        num_verified=loops.num_verified,
+        num_proposed=len(loops.proposed),
+        num_verified=len(loops.verified),
         num_closed=len(loops.closed),
         num_contradicted=len(loops.contradicted),
         moved_m=loops.moved_m(found.trajectory.as_in(found.final)),
@@ -280,7 +280,8 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         yield CenterCovariances(tuple(by_photo), *np.array(list(by_photo.values()))[:, rows, columns].T)
     if found.refined is not None and (loops := found.refined.loops) is not None:
         kinds = {"closed": loops.closed, "contradicted": loops.contradicted}
-        pairs = [(*pair, kind) for kind, of_kind in kinds.items() for pair in of_kind]
+        name_of = {id_: image.name for id_, image in found.final.images.items()}
+        pairs = [(name_of[a], name_of[b], kind) for kind, of_kind in kinds.items() for a, b in sorted(of_kind)]
         yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
     if not (offset := found.path.time_offset).is_given:
         yield TimeOffsetCurve(offset.curve.offsets_s, offset.curve.costs)

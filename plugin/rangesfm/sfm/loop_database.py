@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Indices
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.progress import Progress
 from rangesfm.sfm.database import copy_database
@@ -96,6 +97,11 @@ class LoopMatching(Workspace):
                     return f"{image.name} has no descriptors in the database"
         return None
 
+    @property
+    def seed(self) -> int:
+        """Seed of random numbers."""
+        return self.options.seed
+
     def known(self) -> dict[int, set[int]]:
         """Return the photos that each photo was matched with by the mapping or tied with, by its id."""
         known: dict[int, set[int]] = defaultdict(set)
@@ -118,6 +124,27 @@ class LoopMatching(Workspace):
                 if len(matches) >= MIN_NUM_SHARED:
                     verified[pair] = matches
         return verified
+
+    def merge_tracks(self, model: pycolmap.Reconstruction) -> None:
+        """Merge and complete the tracks of a model by all matches, in place: points that two passes saw become one.
+
+        Poses and cameras stay. The ids of photos and features are those of the database.
+        """
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=self.seed)
+        options.triangulation.random_seed = options.mapper.random_seed = self.seed
+        triangulation = options.get_triangulation()
+        with colmap_log(self.log):
+            with pycolmap.Database.open(self.database) as database:
+                cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions(load_all_images=True))
+            mapper = pycolmap.IncrementalMapper(cache)
+            mapper.begin_reconstruction(model)
+            mapper.complete_and_merge_tracks(triangulation)
+            mapper.retriangulate(triangulation)
+            mapper.complete_and_merge_tracks(triangulation)
+            mapper.observation_manager.filter_observations_with_negative_depth()
+            mapper.filter_points(options.get_mapper())
+            mapper.end_reconstruction(discard=False)
+            model.update_point_3d_errors()
 
     def keep(self, proposed: Collection[Pair], verified: Collection[Pair], accepted: Collection[Pair]) -> None:
         """Forget the matches of all pairs that were tried as loops, except those that are accepted or do not match."""

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import compress
 
 import numpy as np
 import pycolmap
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED, ids_seen_in, overlaps_in
-from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.estimation.vision_information import Loop
 from rangesfm.sfm.loop_database import Pair
 from rangesfm.sfm.loops.candidates import Views, predicted_overlaps, propose_pairs
 from rangesfm.sfm.loops.relative_errors import RelativeErrors
-from rangesfm.sfm.loops.resection import MAX_CHANCE, Loop, resection_options
+from rangesfm.sfm.loops.resection import resect
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.rotations import cross_matrices
 from rangesfm.util.geometry.trajectory import Trajectory, pose_of
+
+MAX_CHANCE = 1e-6
+"""Probability by chance of a difference between photos and map below which a loop is taken for a wrong one. A survey
+has thousands of pairs, of which none should be lost by chance."""
 
 
 @dataclass(frozen=True)
@@ -30,30 +35,18 @@ class LoopFinder:
 
     Attributes:
         model: the map, metres.
-        path: its keyframes.
-        errors: of these keyframes.
+        path: its keyframes. map_errors: how these err.
         pixel_stddev: standard deviation of a coordinate of a feature.
-        seed: of random numbers.
     """
 
     model: pycolmap.Reconstruction
     path: Trajectory
-    errors: RelativeErrors
+    map_errors: MapErrors
     pixel_stddev: float
-    seed: int
 
-    @classmethod
-    def in_refined_map(
-        cls,
-        model: pycolmap.Reconstruction,
-        trajectory: Trajectory,
-        errors: MapErrors,
-        pixel_stddev: float,
-        seed: int,
-    ) -> LoopFinder:
-        """Return the finder of loops in a refined map; ``trajectory`` has its keyframes, also in another world."""
-        path = trajectory.as_in(model)
-        return cls(model, path, RelativeErrors.of_keyframes(errors, path.frame_ids, path.centers), pixel_stddev, seed)
+    @cached_property
+    def errors(self) -> RelativeErrors:
+        return RelativeErrors.of_keyframes(self.map_errors, self.path.frame_ids, self.path.centers)
 
     @cached_property
     def views(self) -> Views:
@@ -89,74 +82,63 @@ class LoopFinder:
             known[ids[first]].add(ids[second])
         return known
 
-    def tested(self, verified: Mapping[Pair, Indices]) -> tuple[list[Loop], list[Pair]]:
+    def tested(self, verified: Mapping[Pair, Indices], *, seed: int) -> tuple[dict[Pair, Loop], list[Pair]]:
         """Return the loops that fit the map, and the pairs that it contradicts.
 
         Pairs whose matches have too few points say nothing and are in neither.
 
         Args:
             verified: matches (m, 2) of features that fit a two-view geometry, by pair.
+            seed: of random numbers.
         """
-        found = (self._loop_of_pair(pair, matches) for pair, matches in verified.items())
-        loops = [loop for loop in found if loop is not None]
-        fits = [loop.chance(self.errors) >= MAX_CHANCE for loop in loops]
-        return list(compress(loops, fits)), [loop.image_ids for loop, is_right in zip(loops, fits) if not is_right]
+        found = {pair: self._loop_of_pair(pair, matches, seed) for pair, matches in verified.items()}
+        told = {pair: loop for pair, loop in found.items() if loop is not None}
+        loops = {pair: loop for pair, (loop, chance) in told.items() if chance >= MAX_CHANCE}
+        return loops, [pair for pair in told if pair not in loops]
 
-    def relative_poses(self, loops: Sequence[Loop]) -> LoopPoses:
-        """Return what loops say, for the keyframe graph, by ids of frames."""
-        held, moved = (
-            self.path.frame_ids[np.array(of, dtype=np.int64)] for of in zip(*((one.held, one.moved) for one in loops))
-        )
-        from_held, from_moved = (
-            np.array([pose_of(self.model.frame(id_)).rotation.matrix().T for id_ in ids.tolist()])
-            for ids in (held, moved)
-        )
-        turned = Rotation.from_rotvec([loop.turn for loop in loops]).as_matrix() @ from_moved
-        apart = [self.errors.centers[loop.moved] + loop.shift - self.errors.centers[loop.held] for loop in loops]
-        axes = np.zeros((len(loops), 6, 6))
-        axes[:, :3, :3], axes[:, 3:, 3:] = turned, from_held
-        information = np.linalg.inv([loop.covariance(self.errors) for loop in loops])
-        return LoopPoses(
-            held,
-            moved,
-            np.swapaxes(from_held, 1, 2) @ turned,
-            np.einsum("lji,lj->li", from_held, np.array(apart)),
-            np.swapaxes(axes, 1, 2) @ information @ axes,
-        )
+    def _loop_of_pair(self, image_ids: Pair, matches: Indices, seed: int) -> tuple[Loop, float] | None:
+        """Return what a pair says, and the probability that photos differ as much from the map by chance.
 
-    def _loop_of_pair(self, image_ids: tuple[int, int], matches: Indices) -> Loop | None:
-        """Return what the verified matches of a pair say; None if too few of them agree on a pose.
+        None if too few of its verified matches agree on a pose.
 
         Args:
-            image_ids: of the pair, smaller first.
             matches: (m, 2) indices of features of the two photos.
         """
         ways = [(image_ids, matches), (image_ids[::-1], matches[:, ::-1])]
         seen = [(*way, self._seen(way[0][0], way[1])) for way in ways]
-        (held, moved), matches, ids = max(seen, key=lambda way: int((way[2] >= 0).sum()))
-        image, ids, places = self.model.image(moved), ids[ids >= 0], matches[ids >= 0, 1]
-        if len(ids) < MIN_NUM_SHARED:
-            return None
+        photos, matches, ids = max(seen, key=lambda way: int((way[2] >= 0).sum()))
+        image, ids, places = self.model.image(photos[1]), ids[ids >= 0], matches[ids >= 0, 1]
         points = np.array([self.model.point3D(id_).xyz for id_ in ids.tolist()])
         pixels = np.array([image.points2D[k].xy for k in places.tolist()])
         camera = self.model.camera(image.camera_id)
-        found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, resection_options(self.seed))
-        if found is None or int(found["num_inliers"]) < MIN_NUM_SHARED:
+        if (found := resect(pixels, points, camera, seed)) is None:
             return None
-        fits = np.asarray(found["inlier_mask"])
+        cam_from_world, fits = found
         before = pose_of(self.model.frame(image.frame_id))
-        cam_from_rig = image.cam_from_world() * before.inverse()
-        after = cam_from_rig.inverse() * found["cam_from_world"]
-        turn = Rotation.from_matrix(after.rotation.matrix().T @ before.rotation.matrix()).as_rotvec()
-        row = self.views.row_of[moved]
-        world_from_cam = found["cam_from_world"].rotation.matrix().T
-        center = -world_from_cam @ found["cam_from_world"].translation
-        by_point = _pixels_by_points(points[fits] - center, world_from_cam[None], self.views.focal_px[row])
+        after = (image.cam_from_world() * before.inverse()).inverse() * cam_from_world
+        from_map = after.rotation.matrix().T @ before.rotation.matrix()
         shift = _center(after) - _center(before)
-        in_cam = (points[fits] - center) @ world_from_cam
-        residuals_px = np.asarray(camera.img_from_cam(in_cam)) - pixels[fits]
+        world_from_cam = cam_from_world.rotation.matrix().T
+        row, from_camera = self.views.row_of[photos[1]], points[fits] - _center(cam_from_world)
+        by_point = _pixels_by_points(from_camera, world_from_cam[None], self.views.focal_px[row])
+        residuals_px = np.asarray(camera.img_from_cam(from_camera @ world_from_cam)) - pixels[fits]
         frames, by_frame, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, _center(after))
-        return Loop(image_ids, self._frame_of(held), self._frame_of(moved), turn, shift, frames, by_frame, noise)
+
+        def covariance(frame: int, by_own: Array) -> Array:
+            """Return the (6, 6) covariance of the pose by the points against what depends on another keyframe."""
+            return noise + self.errors.covariance(np.append(frames, frame), np.concatenate([by_frame, by_own]))
+
+        held, moved = (int(self.views.frame[self.views.row_of[photo]]) for photo in photos)
+        difference = np.concatenate([Rotation.from_matrix(from_map).as_rotvec(), shift])
+        squared = difference @ np.linalg.solve(covariance(moved, -np.eye(6)[None]), difference)
+        chance = float(chdtrc(len(difference), float(squared)))
+        information = np.linalg.inv(covariance(held, -self.errors.carried(held, np.array([moved]))))
+        reference, frame = self.path.frame_ids[[held, moved]].tolist()
+        from_held, turned = pose_of(self.model.frame(reference)).rotation.matrix().T, after.rotation.matrix().T
+        axes = block_diag(turned, from_held)
+        apart = self.errors.centers[moved] + shift - self.errors.centers[held]
+        loop = Loop(reference, frame, from_held.T @ turned, from_held.T @ apart, axes.T @ information @ axes)
+        return loop, chance
 
     def _seen(self, image_id: int, matches: Indices) -> Indices:
         """Return the (m,) ids of the points behind the first features of matches; -1 where there is none."""
@@ -173,9 +155,6 @@ class LoopFinder:
         known, first = np.unique(ids[order], return_index=True)
         return known, np.append(first, len(ids)), view[order]
 
-    def _frame_of(self, image_id: int) -> int:
-        return int(self.views.frame[self.views.row_of[image_id]])
-
     def _dependence(
         self, ids: Indices, points: Array, by_point: Array, residuals_px: Array, center: Array
     ) -> tuple[Indices, Array, Array]:
@@ -188,7 +167,8 @@ class LoopFinder:
             center: (3,) origin of the placed rig.
 
         Returns:
-            As the attributes ``frames``, ``by_frame`` and ``noise`` of a loop, all of first order.
+            Keyframes (f,) on whose errors the pose depends, its derivatives (f, 6, 6) by these (turn about the axes of
+            the world, shift of the rig's origin), and its covariance (6, 6) that is due to the features alone.
         """
         views, (known, first, view) = self.views, self._sightings
         place = np.searchsorted(known, ids)

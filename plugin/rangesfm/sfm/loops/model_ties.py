@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -12,7 +11,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.sfm.loop_database import Pair
-from rangesfm.sfm.loops.resection import resection_options
+from rangesfm.sfm.loops.resection import resect
 from rangesfm.util.geometry.similarity import Similarity
 
 # Matches of one pair may agree by chance; photos of a path that comes back match in more than one.
@@ -105,13 +104,9 @@ class _MatchedPoints:
 
     def similarity(self, seed: int) -> Similarity | None:
         """Return first_from_second with the second photo placed by the first model's points; None if it cannot be."""
-        options, pixels = resection_options(seed), self.pixels[1]
-        found: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
-            pixels, self.in_first, self.cameras[1], options
-        )
-        if found is None or int(found["num_inliers"]) < MIN_NUM_SHARED:
+        if (found := resect(self.pixels[1], self.in_first, self.cameras[1], seed)) is None:
             return None
-        fits, cam_from_first = np.asarray(found["inlier_mask"]), found["cam_from_world"]
+        cam_from_first, fits = found
         to_first = cam_from_first.rotation.matrix().T
         center, own_center = -to_first @ cam_from_first.translation, self.photos[1].projection_center()
         lengths, own_lengths = (
