@@ -38,7 +38,8 @@ from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.measurements.ranges.scale.solution import solution_from
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect

@@ -21,7 +21,8 @@ from rangesfm.measurements.ranges.errors.components import components
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
 from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
 from rangesfm.measurements.ranges.scale.range_equation import predicted_ranges
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
+from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
 from rangesfm.measurements.ranges.scale.solution import solve_scale
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.trajectory import in_first_camera

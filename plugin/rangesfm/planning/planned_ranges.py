@@ -22,9 +22,9 @@ from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale, bins_on
-from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.measurements.ranges.scale.solution import refuse_ambiguity, solution_from
 from rangesfm.options import LENGTH_M
 from rangesfm.planning.planned import PlannedSurvey
@@ -53,16 +53,15 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     into = first_camera if planned.anchor_frame == "first_camera" else IDENTITY
     told = [replace(a, position_m=into.apply(at)) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)]
     given = RangesOnPath(_observations(planned), path, bending, told, planned.anchor_frame, planned.range_model)
-    ranges = RangesToSolve(given)
-    posed = ranges.posed(others)
-    state = true_state(planned, posed)
+    posed = given.posed(others)
+    state, prior = true_state(planned, posed), posed.prior_errors
     tags_m, placing_m = antenna_positions(posed.ranges, state.metric_from_model), posed.placing_stddev_m(1.0)
     noise_m = planned.given_sizes.get("white", START_STDDEV_M)
-    stddev_m = np.sqrt(noise_m**2 + placing_m**2 + posed.errors.shared_m**2)
-    errors = replace(posed.errors.at(tags_m, placing_m), stddev_m=stddev_m)
+    stddev_m = np.sqrt(noise_m**2 + placing_m**2 + prior.shared_m**2)
+    errors = replace(prior.at(tags_m, placing_m), stddev_m=stddev_m)
     weighted = posed.weighted(errors)
     fit = fit_at(weighted, state, np.full(len(posed.rows), float(planned.num_alike)))
-    return ranges.solved(RangesOnMap.at(posed, weighted, fit, errors, noise_m))
+    return RangeScale.begun(RangesOnMap.at(posed, weighted, fit, errors, noise_m))
 
 
 def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:

@@ -33,8 +33,7 @@ from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ran
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesToSolve
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
+from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesOnPath
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -73,14 +72,13 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
         return RangesAtRest(before, at.path, at.metres_per_unit, ranges, at.rest.state, at.bending)
     if inputs.tape.distances:
         distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
-    given = RangesOnPath(
+    return RangesOnPath(
         *(at.observations, at.path, at.bending, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
         gravity=gravity_of(survey.scale.up_in_first_camera),
         camera_side=survey.scale.camera_side,
         site=inputs.site,
         seed=survey.output.seed,
     )
-    return RangesToSolve(given)
 
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:

@@ -14,7 +14,8 @@ from tests.simulated.range_problem import range_problem
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.measurements.ranges.scale import starts
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
+from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
 from rangesfm.measurements.ranges.scale.starts import (
     choose_sides,
     complete_unknown_anchors,

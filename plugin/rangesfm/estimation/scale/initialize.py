@@ -27,8 +27,7 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
-from rangesfm.measurements.ranges.scale.range_start import RangesToSolve
-from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
@@ -73,16 +72,16 @@ def initialize_scale(
         GeometryError: the scale is not determined.
     """
     bending = bending or WalkBending(in_first_camera(trajectory))
-    given = RangesOnPath(
+    ranges = RangesOnPath(
         *(observations, trajectory, bending, anchors, anchor_frame, range_model, distances),
         gravity=gravity_of(options.up_in_first_camera),
         camera_side=options.camera_side,
         site=site,
         seed=seed,
     )
-    ranges = (RangesToSolve(given),) if len(observations.log) else ()
     log = RangeEstimate.begun(observations, range_model)
-    return estimate_scale((*ranges, *others), trajectory, bending, options, log)
+    located = (ranges, *others) if len(observations.log) else others
+    return estimate_scale(located, trajectory, bending, options, log)
 
 
 def estimate_scale(

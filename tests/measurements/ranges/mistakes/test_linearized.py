@@ -90,7 +90,6 @@ def small_map(
             ranges=problem,
             model_from_cam=model_from_cam,
             velocity=velocity if has_times else None,
-            errors=errors,
             rows=np.arange(num),
             notes=(),
             left_out=(),

@@ -28,10 +28,10 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, cost_at, solve, state_after
+from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import (
     MIN_NUM_RANGES,
-    RangesOnPath,
     ScaleProblem,
     walking_times_s,
 )
@@ -273,12 +273,12 @@ def _on_given_path(
     )
     given = RangesOnPath(observations, still, WalkBending(still), (), "unknown", model)
     upright = np.tile(np.eye(3), (len(rows), 1, 1))
-    return ScaleProblem(given, ranges, upright, None, errors, rows, (), ())
+    return ScaleProblem(given, ranges, upright, None, rows, (), ())
 
 
 def _located(posed: ScaleProblem) -> Iterator[tuple[int, Linearized, RangesOnMap]]:
     """Yield each anchor at its likeliest place, with the errors that all ranges show; and the robust fit of all."""
-    problem, before = posed.ranges, posed.errors
+    problem, before = posed.ranges, posed.prior_errors
     state = RangeState(IDENTITY, np.zeros((problem.num_anchors, 3)), problem.bias_mean_m.copy())
     noise_m = np.where(before.is_estimated, START_STDDEV_M, before.given_m)
     for k in np.unique(problem.anchor_index):
@@ -332,7 +332,7 @@ def _concluded(
         located, mirror = mirror, located
         covariance = _covariance(located, k)
     bias_m, bias_stddev_m = _bias(located, k)
-    noise_m = np.where(located.on_map.posed.errors.is_estimated, located.scatter_m, located.on_map.posed.errors.given_m)
+    noise_m = np.where(located.on_map.errors.is_estimated, located.scatter_m, located.on_map.errors.given_m)
     return Trilateration(
         position_m=middle + _place_m(located, k),
         covariance_m2=covariance,

@@ -66,6 +66,13 @@ class RangeScale(KindOnMap):
     is_solved = shows_bending = True
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
 
+    @classmethod
+    def begun(cls, solved: RangesOnMap, notes: tuple[str, ...] = ()) -> RangeScale:
+        """Return ranges at a solution on the path of the unscaled model."""
+        given = solved.posed.given
+        told = RangeEstimate.begun(given.observations, given.range_model)
+        return cls(solved, given.trajectory, 1.0, told, notes)
+
     @property
     def places_map(self) -> bool:
         """Whether the frame is that of surveyed anchors."""

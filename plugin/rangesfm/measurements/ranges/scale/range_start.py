@@ -3,46 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rangesfm.measurements.joint_map import KindOnMap, Located, upward_by
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.cost import Ranges, anchors_at
+from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
-from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
-from rangesfm.measurements.ranges.scale.scale_problem import (
-    RangesOnPath,
-    ScaleProblem,
-    scale_problem,
-    turns_and_velocities,
-)
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem, turns_and_velocities
 from rangesfm.measurements.ranges.scale.solution import solution_from, solve_scale
+from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import MapBending
+from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
 
 
 @dataclass(frozen=True)
-class RangesToSolve(Located):
-    """Ranges on an unscaled path: where the map and its anchors are is found beside the other kinds."""
+class RangesOnPath(Located):
+    """The ranges of a log on an unscaled path, with all that is known of anchors and radio before.
 
-    given: RangesOnPath
+    Where the map and its anchors are is found beside the other kinds.
+
+    Attributes:
+        observations: all ranges of the log.
+        trajectory: path of the unscaled model. bending: of the map.
+        anchors: every anchor of the log, with its prior knowledge, in the order of their file.
+        anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
+            keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
+        range_model: what is assumed of the radio.
+        distances: measured ones, with the anchors of the log in its order; those measured by radio between anchors are
+            in the log.
+        gravity: the upward direction in the first camera; None if it is not known.
+        camera_side: side of the anchors' plane on which the camera was, as in the scale options; None if not known.
+        site: frame of the anchors' positions here, from which texts get the coordinates in their file.
+        seed: of searches by chance.
+    """
+
+    observations: RangeObservations
+    trajectory: Trajectory
+    bending: MapBending
+    anchors: Sequence[Anchor]
+    anchor_frame: str
+    range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
+    distances: LocatedDistances = NO_DISTANCES
+    gravity: Gravity | None = None
+    camera_side: str | None = None
+    site: Site = field(default_factory=Site)
+    seed: int = 0
 
     kind = RANGES
 
     def posed(self, others: Sequence[KindOnMap], *, place_is_open: bool = False) -> ScaleProblem:
         """Return their problem beside the other kinds; argument and errors as of ``scale_problem``."""
-        distances = with_lengths(self.given.distances, others)
-        given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
-        placement = placement_by(others, first_camera_from(given.trajectory))
-        return scale_problem(given, placement, place_is_open=place_is_open)
+        distances, gravity = with_lengths(self.distances, others), upward_by(others, self.gravity)
+        placement = placement_by(others, first_camera_from(self.trajectory))
+        return scale_problem(
+            replace(self, distances=distances, gravity=gravity), placement, place_is_open=place_is_open
+        )
 
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges at the best solution of their problem.
@@ -52,15 +79,10 @@ class RangesToSolve(Located):
         """
         found = solve_scale(self.posed(others))
         if not found.why_open:
-            return self.solved(found)
-        posed = self.posed(others, place_is_open=True)
+            return RangeScale.begun(found)
         note = f"the map gets metres, but no place in the site: {found.why_open}"
-        return self.solved(solution_from(posed, found.state.in_frame_of_model()), (note,))
-
-    def solved(self, found: RangesOnMap, notes: tuple[str, ...] = ()) -> RangeScale:
-        """Return the ranges at a solution of their problem."""
-        told = RangeEstimate.begun(self.given.observations, self.given.range_model)
-        return RangeScale(found, self.given.trajectory, 1.0, told, notes)
+        unplaced = self.posed(others, place_is_open=True)
+        return RangeScale.begun(solution_from(unplaced, found.state.in_frame_of_model()), (note,))
 
 
 @dataclass(frozen=True)

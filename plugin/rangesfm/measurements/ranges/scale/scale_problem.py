@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances, surveyed_distances
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances, surveyed_distances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
-from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import lengths_by_radio
@@ -20,49 +20,17 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_steep
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
-from rangesfm.options import RangeModelOptions
-from rangesfm.solver.bending import MapBending
-from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import path_shape, rounding_of
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory
+
+if TYPE_CHECKING:
+    from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 
 MIN_NUM_RANGES = 4
 """Fewest ranges that place an anchor: three determine a position, and a fourth one checks it."""
 MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
-
-
-@dataclass(frozen=True)
-class RangesOnPath:
-    """The ranges of a log on an unscaled path, with all that is known of anchors and radio before.
-
-    Attributes:
-        observations: all ranges of the log.
-        trajectory: path of the unscaled model. bending: of the map.
-        anchors: every anchor of the log, with its prior knowledge, in the order of their file.
-        anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
-            keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
-        range_model: what is assumed of the radio.
-        distances: measured ones, with the anchors of the log in its order; those measured by radio between anchors are
-            in the log.
-        gravity: the upward direction in the first camera; None if it is not known.
-        camera_side: side of the anchors' plane on which the camera was, as in the scale options; None if not known.
-        site: frame of the anchors' positions here, from which texts get the coordinates in their file.
-        seed: of searches by chance.
-    """
-
-    observations: RangeObservations
-    trajectory: Trajectory
-    bending: MapBending
-    anchors: Sequence[Anchor]
-    anchor_frame: str
-    range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
-    distances: LocatedDistances = NO_DISTANCES
-    gravity: Gravity | None = None
-    camera_side: str | None = None
-    site: Site = field(default_factory=Site)
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,7 +43,6 @@ class ScaleProblem:
         model_from_cam: (k, 3, 3) rotations of the keyframe nearest to each range.
         velocity: (k, 3) camera velocity at each range, model units per second. None without times, or if the photos'
             times do not increase along the path.
-        errors: prior errors of its ranges, before anything is estimated.
         rows: (k,) rows of the observations that its ranges are.
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
@@ -85,7 +52,6 @@ class ScaleProblem:
     ranges: RangeProblem
     model_from_cam: Array
     velocity: Array | None
-    errors: RangeErrors
     rows: Indices
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -94,6 +60,11 @@ class ScaleProblem:
     def observations(self) -> RangeObservations:
         """All ranges of the log."""
         return self.given.observations
+
+    @property
+    def prior_errors(self) -> RangeErrors:
+        """Errors of its ranges before anything is estimated."""
+        return RangeErrors.begin(self.observations, self.rows, self.given.range_model)
 
     @property
     def on_path(self) -> OnPath:
@@ -207,7 +178,7 @@ def scale_problem(
         placement=placement,
     )
     turns, velocity = turns_and_velocities(observations, rows, given.trajectory)
-    return ScaleProblem(given, ranges, turns, velocity, errors, rows, tuple(notes), left_out)
+    return ScaleProblem(given, ranges, turns, velocity, rows, tuple(notes), left_out)
 
 
 def turns_and_velocities(

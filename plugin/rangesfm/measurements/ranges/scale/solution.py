@@ -75,7 +75,7 @@ def solve_scale(posed: ScaleProblem) -> RangesOnMap:
     Raises:
         GeometryError: nothing fits, or two maps of different scales fit.
     """
-    problem, errors = posed.ranges, posed.errors
+    problem, errors = posed.ranges, posed.prior_errors
     if problem.placement is not None:  # known positions say where the map is, so that there is nothing to search for
         start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
         return solution_from(posed, complete_unknown_anchors(problem, start))
@@ -186,7 +186,7 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> RangesOnMap:
     def shown(errors: RangeErrors, state: RangeState) -> RangeErrors:
         return seen(errors.inflated(residuals_m(state)), state)
 
-    state, used = start, seen(posed.errors, start)
+    state, used = start, seen(posed.prior_errors, start)
     for _ in range(_NUM_ROUNDS):
         state = solve(posed.weighted(used).by_some(rows), state, loss=used.loss).state
         used = shown(used, state)
