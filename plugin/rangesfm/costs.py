@@ -6,7 +6,6 @@ installed pyceres (``rangesfm doctor`` says why).
 """
 
 from rangesfm.solver import (
-    add_normal_prior,
     add_residual_block,
     direction_cost,
     distance_cost,
@@ -19,7 +18,6 @@ from rangesfm.solver import (
 )
 
 __all__ = [
-    "add_normal_prior",
     "add_residual_block",
     "direction_cost",
     "distance_cost",

@@ -15,12 +15,11 @@ import pycolmap
 import pytest
 
 from rangesfm.solver import (
-    add_normal_prior,
     add_residual_block,
     distance_cost,
+    joint_prior_cost,
     keep_from_elimination,
     range_cost,
-    tangent_jacobian,
 )
 
 if TYPE_CHECKING:
@@ -61,46 +60,6 @@ def test_a_block_given_twice_is_refused(
     cost = distance_cost(distance_m=1.0, stddev_m=0.1, a_in_cam_m=[0, 0, 0], b_in_cam_m=[1, 0, 0])
     with pytest.raises(ValueError, match="given twice"):
         add_residual_block(adjuster, cost, None, [pose, pose_block(reconstruction, 1)])
-
-
-def test_a_normal_prior_is_off_by_its_stddevs(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
-    problem = (adjuster := adjuster_of(reconstruction)).problem
-    block, bias = np.array([1.2, 1.0, 7.0]), np.array([1e-9])
-    add_normal_prior(adjuster, block, mean=[1.0, 2.0, 3.0], stddev=[0.1, 0.5, 2.0])
-    add_normal_prior(adjuster, bias, mean=[0.0], stddev=1e-9)
-    assert problem.evaluate_residuals()[-4:] == pytest.approx([2.0, -2.0, 2.0, 1.0], rel=1e-12)
-    jacobian = tangent_jacobian(problem, [block, bias]).toarray()
-    np.testing.assert_allclose(jacobian[-4:], np.diag([10.0, 2.0, 0.5, 1e9]), rtol=1e-12)
-
-
-def test_further_errors_widen_a_normal_prior(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
-    problem = (adjuster := adjuster_of(reconstruction)).problem
-    off, further = np.array([0.3, -0.1, 0.2]), np.array([[0.09, 0.02, 0], [0.02, 0.04, 0], [0, 0, 0]])
-    add_normal_prior(adjuster, off.copy(), np.zeros(3), 0.1, further)
-    squared = off @ np.linalg.solve(further + 0.01 * np.eye(3), off)
-    assert np.sum(np.square(problem.evaluate_residuals()[-3:])) == pytest.approx(squared, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("mean", "stddev"),
-    [
-        ([1.0, 2.0, 3.0], [1.0, 1.0]),
-        ([1.0], 1.0),
-        ([], 1.0),
-        ([1.0, 2.0], 0.0),
-        ([1.0, 2.0], [1.0, -1.0]),
-        ([1.0, np.nan], 1.0),
-        ([1.0, 2.0], np.inf),
-        ([1.0, 2.0], 1e-200),  # no number can hold its variance
-        ([1.0, 2.0], 1e200),
-    ],
-)
-def test_a_normal_prior_that_means_nothing_is_refused(
-    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, mean: list[float], stddev: float | list[float]
-) -> None:
-    # Given such a prior, Ceres would abort the process.
-    with np.errstate(over="ignore"), pytest.raises(ValueError, match=r"^a prior of|broadcast"):
-        add_normal_prior(adjuster_of(reconstruction), np.zeros(2), mean, stddev)
 
 
 def test_a_range_adds_half_its_squared_residual_to_the_bundle_adjustments_cost(
@@ -229,7 +188,7 @@ def adjuster_with_free_anchor(
         distance = unbiased.evaluate(pose, ANCHOR_IN_WORLD_M, bias)[0].item() + 1.0
         cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
         add_residual_block(adjuster, cost, None, [pose, anchor, bias])
-    add_normal_prior(adjuster, bias, mean=[0.0], stddev=0.1)
+    add_residual_block(adjuster, joint_prior_cost(mean=[[0.0]], whitening=[[10.0]]), None, [bias])
     adjuster.options.ceres.solver_options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
     return adjuster, anchor, bias
 

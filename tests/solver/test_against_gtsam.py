@@ -25,9 +25,9 @@ from tests.solver.test_covariance import (
 )
 
 from rangesfm.solver import (
-    add_normal_prior,
     add_residual_block,
     distance_cost,
+    joint_prior_cost,
     keep_from_elimination,
     position_cost,
 )
@@ -96,7 +96,8 @@ def by_ceres(measured: Measured) -> tuple[Array, Array, MapErrors]:
     survey = Joint(reconstruction, adjuster, anchors, no_bias, num_reprojections)
     add_ranges(survey, measured.range_m.T)
     for block, given in zip(anchors, measured.given_anchors_m, strict=True):
-        add_normal_prior(adjuster, block, mean=given, stddev=ANCHOR_STDDEV_M)
+        prior = joint_prior_cost(mean=given[None], whitening=np.eye(3) / ANCHOR_STDDEV_M)
+        add_residual_block(adjuster, prior, None, [block])
     for block in no_bias:
         problem.set_parameter_block_constant(block)
     for (a, b), length_m in zip(BETWEEN_ANCHORS, measured.between_anchors_m.tolist(), strict=True):

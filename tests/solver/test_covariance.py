@@ -16,9 +16,9 @@ from tests.simulated.path import look_at, orbit_path
 
 from rangesfm.errors import GeometryError
 from rangesfm.solver import (
-    add_normal_prior,
     add_residual_block,
     distance_cost,
+    joint_prior_cost,
     keep_from_elimination,
     range_cost,
     tangent_jacobian,
@@ -147,7 +147,8 @@ def joint(
     range_m = np.linalg.norm(tags - ANCHORS_M[:num_anchors, None], axis=2)
     add_ranges(survey, range_m + (0.0 if range_errors_m is None else range_errors_m))
     for position, bias in zip(survey.anchors, survey.biases, strict=False):
-        add_normal_prior(adjuster, bias, mean=[0.0], stddev=BIAS_STDDEV_M)
+        prior = joint_prior_cost(mean=[[0.0]], whitening=[[1 / BIAS_STDDEV_M]])
+        add_residual_block(adjuster, prior, None, [bias])
         if hold_anchors:
             survey.problem.set_parameter_block_constant(position)
     return survey

@@ -212,7 +212,9 @@ def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
         params = metric.camera(camera_id).params
         if problem.has_parameter_block(params) and not problem.is_parameter_block_constant(params):
             stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
-            solver.add_normal_prior(bundle.adjuster, params, given.params, stddev / bundle.pixel_stddev)
+            whitening = np.diag(bundle.pixel_stddev / stddev)
+            cost = solver.joint_prior_cost(mean=given.params[None], whitening=whitening)
+            solver.add_residual_block(bundle.adjuster, cost, None, [params])
 
 
 def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:

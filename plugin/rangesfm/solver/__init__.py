@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 from rangesfm.solver.adjuster_problem import (
     Step,
-    add_normal_prior,
     add_residual_block,
     keep_from_elimination,
     num_columns,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Step",
-    "add_normal_prior",
     "add_residual_block",
     "check_compatibility",
     "direction_cost",

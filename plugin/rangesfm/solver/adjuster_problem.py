@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csc_array, csr_array
 
 from rangesfm.arrays import Array
@@ -59,40 +58,6 @@ def add_residual_block(
     for pose in held:
         problem.set_parameter_block_constant(pose)
     _used_by_adjuster.setdefault(adjuster, []).append((cost, loss, blocks))
-
-
-def add_normal_prior(
-    adjuster: pycolmap.CeresBundleAdjuster,
-    block: Array,
-    mean: npt.ArrayLike,
-    stddev: npt.ArrayLike,
-    covariance: Array | None = None,
-) -> None:
-    """Add a prior for each of the n numbers of a block, as the residual ``(x - mean) / stddev``.
-
-    Args:
-        adjuster: as in ``add_residual_block``.
-        block: (n,) without a manifold, such as an anchor, a range bias or a lever arm.
-        mean: (n,) in the block's unit.
-        stddev: one for all, or (n,), positive, in the block's unit.
-        covariance: (n, n) of further errors, square units; None: there are none.
-
-    Raises:
-        ValueError: a value is not finite, or a standard deviation is not positive, or a shape is wrong.
-    """
-    means, stddevs = np.asarray(mean, dtype=np.float64), np.broadcast_to(stddev, block.shape)
-    variances = np.square(stddevs)
-    is_right = np.isfinite(means) & (stddevs > 0) & (variances > 0) & np.isfinite(variances)
-    if means.shape != block.shape or not is_right.all():
-        raise ValueError(
-            f"a prior of mean {mean!r} and stddev {stddev!r}, expected finite and positive for each number"
-        )
-    check_compatibility()
-    import pyceres
-
-    of_all = np.diag(variances) if covariance is None else np.diag(variances) + covariance
-    cost = pyceres.factors.NormalPrior(means, of_all)
-    add_residual_block(adjuster, cost, None, [block])
 
 
 def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, point: Array) -> None:

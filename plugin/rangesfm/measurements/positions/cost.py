@@ -239,7 +239,7 @@ class MarkedPositions(Measurements):
         return replace(self, beyond_m2=beyond_m2)
 
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
-        for row, name in enumerate(self.names):
-            further = self.beyond_m2.get(name, np.zeros((3, 3))) / adjustment.pixel_stddev**2
-            stddev = self.stddev_m[row] / adjustment.pixel_stddev
-            solver.add_normal_prior(adjustment.adjuster, blocks["mark", name], self.position_m[row], stddev, further)
+        roots = adjustment.pixel_stddev * self.weights.root_information
+        for name, position_m, whitening in zip(self.names, self.position_m, roots, strict=True):
+            cost = solver.joint_prior_cost(mean=position_m[None], whitening=whitening)
+            solver.add_residual_block(adjustment.adjuster, cost, None, [blocks["mark", name]])
