@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -44,25 +44,7 @@ _TOLERANCE = 0.001
 _NUM_VISIBLE_STDDEVS = 3.0
 
 
-@dataclass(frozen=True)
-class Straightened:
-    """A map without drift.
-
-    Attributes:
-        problem: with the noise of the measurements. blocks: with their new values.
-        num_absorbed: degrees of freedom of each kind that the map absorbs.
-        bend_m: root mean square distance of the keyframes from their best fit by one similarity.
-        num_steps: of the solver of the keyframe graph.
-    """
-
-    problem: MapProblem
-    blocks: dict[Block, Array]
-    num_absorbed: tuple[float, ...]
-    bend_m: float
-    num_steps: int
-
-
-def straighten(problem: MapProblem, rays: Observations) -> Straightened:
+def straighten(problem: MapProblem, rays: Observations) -> GraphSolution:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The noise is estimated again with every solution. While the drift is large, the residuals and their standard
@@ -74,13 +56,14 @@ def straighten(problem: MapProblem, rays: Observations) -> Straightened:
         rays: all observations of the photos.
     """
     if not problem.kinds:
-        return Straightened(problem, {}, (), 0.0, 0)
+        return GraphSolution(problem.start)
     graph = _graph(problem, rays, problem.start.blocks)
-    fit, problem = _solve_with_own_noise(graph, problem)
-    return _moved(problem, rays, graph, fit)
+    fit = _solve_with_own_noise(graph, problem)
+    _move(problem, rays, graph.vision, fit.state.poses)
+    return fit
 
 
-def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array]) -> Straightened:
+def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array]) -> Mapping[Block, Array]:
     """Solve the keyframe graph again from a model that was refined, with known noise, and move the model, in place.
 
     New weights turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem,
@@ -88,14 +71,19 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
 
     Args:
         rays: all observations of the photos. blocks: as they are now.
+
+    Returns:
+        the blocks with their new values.
     """
     graph = _graph(replace(problem, is_refined=True), rays, blocks)
-    return _moved(problem, rays, graph, _solve_precisely(graph, problem, graph.start))
+    state = _solve_precisely(graph, problem, graph.start).state
+    _move(problem, rays, graph.vision, state.poses)
+    return state.blocks
 
 
 def close_in_graph(
     problem: MapProblem, known: MapProblem, rays: Observations, loops: Sequence[Loop]
-) -> Straightened | None:
+) -> MapState | None:
     """Close loops of a model that was refined, in place; None where that bends it by no more than photos just see.
 
     A map that bends leaves its ranges on the way, and would lose them as outliers. So their noise is estimated anew, as
@@ -112,20 +100,9 @@ def close_in_graph(
     if farthest(align_points(before, after).apply(before), after) <= _NUM_VISIBLE_STDDEVS * problem.visible_m:
         return None
     if problem.kinds:
-        fit, problem = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)
-    return _moved(problem, rays, graph, fit)
-
-
-def _moved(problem: MapProblem, rays: Observations, graph: KeyframeGraph, fit: GraphSolution) -> Straightened:
-    """Move the model to a solution of its graph, in place, and return the result."""
+        fit = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)
     _move(problem, rays, graph.vision, fit.state.poses)
-    return Straightened(
-        problem=problem,
-        blocks=dict(fit.state.blocks),
-        num_absorbed=fit.num_absorbed,
-        bend_m=_bend(graph.vision.origin.centers, fit.state.poses.centers),
-        num_steps=fit.num_steps,
-    )
+    return fit.state
 
 
 def _graph(
@@ -177,7 +154,7 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int) -> Similarity:
     return Similarity(scale, turn, end - scale * turn @ start)
 
 
-def _solve_with_own_noise(graph: KeyframeGraph, problem: MapProblem) -> tuple[GraphSolution, MapProblem]:
+def _solve_with_own_noise(graph: KeyframeGraph, problem: MapProblem) -> GraphSolution:
     """Estimate the map and the noise that its residuals show: with the wide loss, the bounded one, then precisely.
 
     If so many measurements are wrong that the wide loss follows them, the given map is more likely than its result.
@@ -191,7 +168,7 @@ def _solve_with_own_noise(graph: KeyframeGraph, problem: MapProblem) -> tuple[Gr
     again = shown.replaced(lambda k, kind: kind.under(losses[k])).with_noise_of(state, wide.num_absorbed)
     bounded, found = _alternate(graph, again, state)
     settled = _solve_precisely(graph, found, bounded.state)
-    return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps), found
+    return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps)
 
 
 def _log_likelihood(problem: MapProblem, residuals: list[Array]) -> float:
@@ -213,11 +190,6 @@ def _alternate(graph: KeyframeGraph, problem: MapProblem, start: MapState) -> tu
 
 def _solve_precisely(graph: KeyframeGraph, problem: MapProblem, start: MapState) -> GraphSolution:
     return solve_graph(replace(graph, kinds=problem.kinds), start, tolerance_m=_TOLERANCE * problem.smallest_stddev)
-
-
-def _bend(before: Array, after: Array) -> float:
-    """Return the root mean square distance that no similarity explains; 0 for fewer than three keyframes."""
-    return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
 
 
 def bend(metric: pycolmap.Reconstruction, steps: FrameSteps) -> None:

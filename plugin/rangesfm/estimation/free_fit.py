@@ -25,7 +25,7 @@ from rangesfm.solver.nested_dissection import NestedFactor, SingularError
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.poses import Poses, relative_poses
 from rangesfm.util.geometry.rotations import cross_matrices
-from rangesfm.util.geometry.similarity import rounding_of
+from rangesfm.util.geometry.similarity import align_points, rmse, rounding_of
 from rangesfm.util.geometry.trajectory import Trajectory
 
 _INITIAL_DAMPING = 1e-8
@@ -87,13 +87,18 @@ class GraphSolution:
     """The solution of a keyframe graph.
 
     Attributes:
-        state: the estimate. num_steps: accepted and rejected ones.
+        state: the estimate. kinds: the measurements, with their noise.
         num_absorbed: degrees of freedom of each kind that the parameters absorb, at the start of the last step.
+        num_steps: accepted and rejected ones.
+        bend_m: root mean square distance of the keyframes, from where the graph has its origin, from their best fit by
+            one similarity; 0 for fewer than three.
     """
 
     state: MapState
-    num_steps: int
-    num_absorbed: tuple[float, ...]
+    kinds: tuple[Measurements, ...] = ()
+    num_absorbed: tuple[float, ...] = ()
+    num_steps: int = 0
+    bend_m: float = 0.0
 
 
 def solve_graph(graph: KeyframeGraph, start: MapState, *, tolerance_m: float) -> GraphSolution:
@@ -120,7 +125,9 @@ def solve_graph(graph: KeyframeGraph, start: MapState, *, tolerance_m: float) ->
     if factored is None or used > _INITIAL_DAMPING:  # more would hide what the measurements determine
         factored = _factor(solved.hessian, 0.0, graph.parts)
     absorbed = tuple(_num_absorbed(rows, factored) for rows in solved.whitened)
-    return GraphSolution(state, step_count, absorbed)
+    before, after = graph.vision.origin.centers, state.poses.centers
+    bend_m = rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
+    return GraphSolution(state, graph.kinds, absorbed, step_count, bend_m)
 
 
 @dataclass(frozen=True)

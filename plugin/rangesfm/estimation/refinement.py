@@ -13,7 +13,8 @@ import pycolmap
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.drift import SAME_NOISE, Straightened, close_in_graph, straighten, straighten_again
+from rangesfm.estimation.drift import SAME_NOISE, close_in_graph, straighten, straighten_again
+from rangesfm.estimation.free_fit import GraphSolution
 from rangesfm.estimation.map_problem import MapProblem, equations_of
 from rangesfm.estimation.vision_information import (
     Loop,
@@ -56,7 +57,7 @@ class MapAtRest:
             equations. pixel_stddev_at_rest: the same after it.
         reprojection_rms_px: root mean square length of the reprojection errors.
         solutions: runs of the solver. is_still: whether the keyframes came to rest.
-        bend_m, num_graph_steps: as of ``Straightened``.
+        bend_m, num_graph_steps: of the keyframe graph before.
     """
 
     problem: MapProblem
@@ -96,7 +97,7 @@ def refine(problem: MapProblem, *, with_equations: bool = True) -> MapAtRest:
     """
     with _marks_in_map(problem) as marked:
         marked, adjustment, rays = _without_misplaced(marked)
-        return _adjusted(adjustment, straighten(marked, rays), with_equations=with_equations)
+        return _adjusted(marked, adjustment, straighten(marked, rays), with_equations=with_equations)
 
 
 @contextmanager
@@ -157,21 +158,23 @@ def _just_visible_m(rays: Observations, poses: Poses) -> float:
     return float(np.median(np.abs(in_cam[:, 2]) / rays.root_information))
 
 
-def _adjusted(adjustment: BundleAdjustment, start: Straightened, *, with_equations: bool) -> MapAtRest:
+def _adjusted(
+    problem: MapProblem, adjustment: BundleAdjustment, start: GraphSolution, *, with_equations: bool
+) -> MapAtRest:
     """Alternate between solving the full problem and estimating the noise from its residuals."""
-    problem, blocks = start.problem, start.blocks
+    problem, blocks = replace(problem, kinds=start.kinds), start.state.blocks
     solutions: list[SolverRun] = []
     num_left = problem.options.max_num_iterations
     for num_round in range(_MAX_NUM_ROUNDS):
         if num_round:
             rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(adjustment.pixel_stddev)
-            blocks = straighten_again(problem, rays, blocks).blocks
+            blocks = straighten_again(problem, rays, blocks)
             adjustment = problem.of_photos(num_left)
         added = problem.add_to(adjustment, blocks)
         solutions.append(solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * problem.smallest_stddev))
         num_left -= solutions[-1].num_iterations
         state = problem.state(added)
-        blocks = dict(state.blocks)
+        blocks = state.blocks
         seen = problem.with_noise_of(state, start.num_absorbed)
         if problem.change(seen) < SAME_NOISE or not solutions[-1].converged or num_left <= 0:
             break

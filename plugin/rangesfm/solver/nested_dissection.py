@@ -46,16 +46,33 @@ class SingularError(Exception):
 
 @dataclass(frozen=True)
 class Front:
-    """Blocks that are eliminated at once.
+    """What is eliminated at once: blocks, or columns by their places in the order of elimination.
 
     Attributes:
-        own: (m,) blocks. boundary: (b,) blocks that are eliminated later and that these are tied to, in that order.
+        own: (m,) blocks or columns, these ascending.
+        boundary: (b,) those that are eliminated later and that these are tied to, in that order.
         children: numbers of the fronts before whose boundary begins here.
     """
 
     own: Indices
     boundary: Indices
     children: tuple[int, ...]
+
+    @property
+    def all(self) -> Indices:
+        """(m + b,) own and boundary."""
+        return np.concatenate([self.own, self.boundary])
+
+    @property
+    def span(self) -> slice:
+        """Its own columns."""
+        return slice(int(self.own[0]), int(self.own[-1]) + 1)
+
+    def runs_of(self, child: Front) -> list[tuple[slice, slice]]:
+        """Return the boundary of a child as runs of these columns: the places of each run here, and in the boundary."""
+        at = np.searchsorted(self.all, child.boundary)
+        ends = [0, *(np.flatnonzero(np.diff(at) > 1) + 1).tolist(), len(at)]
+        return [(slice(at[first], at[last - 1] + 1), slice(first, last)) for first, last in pairwise(ends)]
 
 
 def fronts_of(tied: csr_array, may_be_last: Mask) -> list[Front]:
@@ -152,39 +169,11 @@ def cost_of_factor(tied: csr_array) -> float:
     return float(np.sum(own**3 / 3 + own**2 * rest + own * rest**2))
 
 
-class _Shape(NamedTuple):
-    """A front by columns.
-
-    Attributes:
-        columns: (size,) places in the order of elimination, ascending; the first ``num_own`` are eliminated here.
-        children: as of the front.
-    """
-
-    columns: Indices
-    num_own: int
-    children: tuple[int, ...]
-
-    @property
-    def own(self) -> slice:
-        first = int(self.columns[0])
-        return slice(first, first + self.num_own)
-
-    @property
-    def rest(self) -> Indices:
-        return self.columns[self.num_own :]
-
-    def runs_of(self, child: _Shape) -> list[tuple[slice, slice]]:
-        """Return the rest of a child as runs of these columns: the places of each run here, and in the rest."""
-        at = np.searchsorted(self.columns, child.rest)
-        ends = [0, *(np.flatnonzero(np.diff(at) > 1) + 1).tolist(), len(at)]
-        return [(slice(at[first], at[last - 1] + 1), slice(first, last)) for first, last in pairwise(ends)]
-
-
 class _Eliminated(NamedTuple):
     """The eliminated part of a front.
 
     Attributes:
-        lower: (m, m) Cholesky factor of its own part. tie: (m, rest) ``lower``'s inverse times the tie to the rest.
+        lower: (m, m) Cholesky factor of its own part. tie: (m, b) ``lower``'s inverse times the tie to the boundary.
     """
 
     lower: Array
@@ -228,86 +217,88 @@ class NestedFactor:
             fronts = fronts_of(_tied_blocks(matrix, starts), may_be_last)
         self._order = _columns_of([front.own for front in fronts], starts)
         place = np.argsort(self._order)
-        sizes = np.diff(starts)
-        self._shapes = [
-            _Shape(place[_columns_of([f.own, f.boundary], starts)], int(sizes[f.own].sum()), f.children) for f in fronts
+        self._fronts = [
+            Front(place[_columns_of([f.own], starts)], place[_columns_of([f.boundary], starts)], f.children)
+            for f in fronts
         ]
         self._starts, self._place, self._eliminated = starts, place, list[_Eliminated]()
         rests = dict[int, Array]()
-        for number, shape in enumerate(self._shapes):
-            full = matrix if isinstance(matrix, np.ndarray) else self._rows_of_front(matrix, shape)
-            for child in shape.children:
+        for number, front in enumerate(self._fronts):
+            full = matrix if isinstance(matrix, np.ndarray) else self._rows_of_front(matrix, front)
+            for child in front.children:
                 rest = rests.pop(child)
-                runs = shape.runs_of(self._shapes[child])
+                runs = front.runs_of(self._fronts[child])
                 for (rows, of_rows), (columns, of_columns) in combinations_with_replacement(runs, 2):
                     full[rows, columns] += rest[of_rows, of_columns]
-            rests[number] = self._eliminate(shape, full)
-        squares = [np.square(np.diag(front.lower)) for front in self._eliminated]
+            rests[number] = self._eliminate(front, full)
+        squares = [np.square(np.diag(part.lower)) for part in self._eliminated]
         self.pivots = np.concatenate([np.zeros(0), *squares])[place]
 
-    def _rows_of_front(self, matrix: csr_array, shape: _Shape) -> Array:
+    def _rows_of_front(self, matrix: csr_array, front: Front) -> Array:
         """Return a front with the rows of a matrix that are eliminated in it, (size, size), of which the rest is 0."""
-        full = np.zeros((len(shape.columns),) * 2)
-        rows = matrix[self._order[shape.own]].tocoo()
+        columns = front.all
+        full = np.zeros((len(columns),) * 2)
+        rows = matrix[self._order[front.span]].tocoo()
         column = self._place[rows.col]
-        is_later = column >= shape.own.start
-        full[rows.row[is_later], np.searchsorted(shape.columns, column[is_later])] = rows.data[is_later]
+        is_later = column >= front.span.start
+        full[rows.row[is_later], np.searchsorted(columns, column[is_later])] = rows.data[is_later]
         return full
 
-    def _eliminate(self, shape: _Shape, full: Array) -> Array:
-        """Eliminate a front, and return what it adds to the next one, on its rest; only the upper triangle counts."""
-        own = slice(shape.num_own)
+    def _eliminate(self, front: Front, full: Array) -> Array:
+        """Eliminate a front, and return what it adds to the next one, on its boundary; the upper triangle counts."""
+        num = len(front.own)
+        own = slice(num)
         # The matrix is symmetric, so its transpose has the memory order of LAPACK. SciPy's own function reports the
         # failing column only in a text that differs between versions.
         lower, info = linalg.lapack.dpotrf(full[own, own].T, lower=True, overwrite_a=True, clean=True)
         if info > 0:
-            raise SingularError(int(self._order[shape.own.start + info - 1]))
-        front = _Eliminated(lower, np.zeros((shape.num_own, 0)))
-        front = front._replace(tie=front.solved(full[own, shape.num_own :]))
-        self._eliminated.append(front)
-        rest = full[shape.num_own :, shape.num_own :]
-        return np.asarray(linalg.blas.dsyrk(-1.0, front.tie, 1.0, rest.T, trans=1, lower=1).T) if rest.size else rest
+            raise SingularError(int(self._order[front.span.start + info - 1]))
+        part = _Eliminated(lower, np.zeros((num, 0)))
+        part = part._replace(tie=part.solved(full[own, num:]))
+        self._eliminated.append(part)
+        rest = full[num:, num:]
+        return np.asarray(linalg.blas.dsyrk(-1.0, part.tie, 1.0, rest.T, trans=1, lower=1).T) if rest.size else rest
 
     def solve(self, right: Array) -> Array:
         """Solve for a right side of shape (size, k) or (size,)."""
         found = right.reshape(len(right), -1)[self._order]
-        for shape, front in zip(self._shapes, self._eliminated, strict=True):
-            found[shape.own] = front.solved(found[shape.own])
-            found[shape.rest] -= front.tie.T @ found[shape.own]
-        for shape, front in zip(reversed(self._shapes), reversed(self._eliminated), strict=True):
-            found[shape.own] = front.solved(found[shape.own] - front.tie @ found[shape.rest], transposed=True)
+        for front, part in zip(self._fronts, self._eliminated, strict=True):
+            found[front.span] = part.solved(found[front.span])
+            found[front.boundary] -= part.tie.T @ found[front.span]
+        for front, part in zip(reversed(self._fronts), reversed(self._eliminated), strict=True):
+            found[front.span] = part.solved(found[front.span] - part.tie @ found[front.boundary], transposed=True)
         return found[self._place].reshape(right.shape)
 
     def blocks_of_inverse(self) -> list[Array]:
         """Return the diagonal blocks of the inverse."""
         blocks: list[Array] = [np.zeros((0, 0))] * (len(self._starts) - 1)
-        parent_of = {child: number for number, shape in enumerate(self._shapes) for child in shape.children}
+        parent_of = {child: number for number, front in enumerate(self._fronts) for child in front.children}
         of_fronts = dict[int, Array]()
-        for number in reversed(range(len(self._shapes))):
-            shape = self._shapes[number]
-            whole = np.empty((len(shape.columns),) * 2)
+        for number in reversed(range(len(self._fronts))):
+            front, num = self._fronts[number], len(self._fronts[number].own)
+            whole = np.empty((num + len(front.boundary),) * 2)
             if (parent := parent_of.get(number)) is not None:
-                of_rest = whole[shape.num_own :, shape.num_own :]
-                for (rows, of_rows), (columns, of_columns) in product(self._shapes[parent].runs_of(shape), repeat=2):
+                of_rest = whole[num:, num:]
+                for (rows, of_rows), (columns, of_columns) in product(self._fronts[parent].runs_of(front), repeat=2):
                     of_rest[of_rows, of_columns] = of_fronts[parent][rows, columns]
-                if number == self._shapes[parent].children[0]:  # the last one that needs it
+                if number == self._fronts[parent].children[0]:  # the last one that needs it
                     del of_fronts[parent]
             _upwards(self._eliminated[number], whole)
-            for block in np.unique(np.searchsorted(self._starts, self._order[shape.own], side="right") - 1).tolist():
-                places = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
+            for block in np.unique(np.searchsorted(self._starts, self._order[front.span], side="right") - 1).tolist():
+                places = self._place[self._starts[block] : self._starts[block + 1]] - front.span.start
                 blocks[block] = whole[np.ix_(places, places)]
-            if shape.children:
+            if front.children:
                 of_fronts[number] = whole
         return blocks
 
 
-def _upwards(front: _Eliminated, whole: Array) -> None:
-    """Complete the inverse (size, size) of a whole front, of which the part of the rest is known."""
-    own, rest = slice(len(front.lower)), slice(len(front.lower), None)
-    by_rest = front.solved(front.tie, transposed=True)
+def _upwards(part: _Eliminated, whole: Array) -> None:
+    """Complete the inverse (size, size) of a whole front, of which the part of the boundary is known."""
+    own, rest = slice(len(part.lower)), slice(len(part.lower), None)
+    by_rest = part.solved(part.tie, transposed=True)
     whole[own, rest] = -by_rest @ whole[rest, rest]
     whole[rest, own] = whole[own, rest].T
-    whole[own, own] = front.inverse() - whole[own, rest] @ by_rest.T
+    whole[own, own] = part.inverse() - whole[own, rest] @ by_rest.T
 
 
 def _tied_blocks(matrix: csr_array, starts: Indices) -> csr_array:
