@@ -70,8 +70,8 @@ def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: L
     for test in results_of(problem):
         columns, seen, num = test.hypothesis.columns, test.hypothesis.seen, len(problem.bins)
         off_m = columns[:num] if seen is None else seen
-        of_units = [replace(problem.linear, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
-        left = np.stack([Factorization(replace(problem, linear=made)).residual for made in of_units], axis=1)
+        of_units = [replace(problem, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
+        left = np.stack([Factorization(made).residual for made in of_units], axis=1)
         directions = np.random.default_rng(0).standard_normal((test.hypothesis.num, 1000))
         shares = np.sum((left @ directions) ** 2, axis=0)
         shares /= np.einsum("ij,ik,kj->j", off_m @ directions, inverse, off_m @ directions)

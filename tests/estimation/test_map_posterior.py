@@ -42,15 +42,14 @@ def test_parts_of_a_map_err_as_functions_of_it_that_were_not_observed(frame_is_f
         own = (Component("white", np.eye(num), 0.01, 0.5),) if is_used else ()
         unused = np.full(num, is_used)
         return Observations(
-            kind,
             columns,
             design,
             np.zeros(num),
-            by_pose,
-            own,
-            1e-4 * np.eye(num),
-            unused,
-            prior_design=np.zeros((0, columns.num)),
+            kind=kind,
+            by_pose=by_pose,
+            components=own,
+            alone_m2=1e-4 * np.eye(num),
+            is_used=unused,
         )
 
     by_center = np.zeros((NUM, 3, NUM, 6))

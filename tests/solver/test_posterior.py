@@ -44,14 +44,14 @@ def kind(name: str, num: int, seed: int, noise: float, *, is_placed: bool = True
     columns = Columns(0, 1, NONE, NONE, 7) if is_placed else Columns(0, -1, NONE, NONE, 1)
     own, alike = noise**2 * np.eye(num), shared**2 * np.ones((num, num))
     return Observations(
-        name,
         columns,
         rng.standard_normal((num, columns.num)),
         0.1 * rng.standard_normal(num),
-        rng.standard_normal((num, 6 * NUM_POSES)),
-        (Component(f"{name} noise", own), Component(f"{name} shared", alike)),
-        own,
-        np.ones(num, dtype=bool),
+        kind=name,
+        by_pose=rng.standard_normal((num, 6 * NUM_POSES)),
+        components=(Component(f"{name} noise", own), Component(f"{name} shared", alike)),
+        alone_m2=own,
+        is_used=np.ones(num, dtype=bool),
     )
 
 
@@ -73,7 +73,7 @@ def test_the_best_estimate_of_two_kinds_is_that_of_dense_least_squares() -> None
     problem = joined(kinds, Shaken())
     design, residual, covariance = dense(problem, *kinds)
     np.testing.assert_allclose(problem.noise.covariance_m2, covariance)
-    found = problem.linear.solved(problem.noise.covariance_m2)
+    found = problem.solved(problem.noise.covariance_m2)
     inverse = np.linalg.inv(covariance)
     expected = np.linalg.inv(design.T @ inverse @ design)
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-8)
@@ -92,7 +92,7 @@ def test_a_mistake_is_found_with_its_size_also_where_it_is_not_used() -> None:
     design, _, _ = dense(problem, *kinds)
     columns = np.zeros((15, 1))
     columns[3] = 1.0
-    exact = replace(problem, linear=replace(problem.linear, residual_m=design @ np.arange(7.0) - 0.8 * columns[:, 0]))
+    exact = replace(problem, residual_m=design @ np.arange(7.0) - 0.8 * columns[:, 0])
     for problem in (exact, replace(exact, is_used=np.arange(15) != 3)):
         found = problem.mistake(columns)
         assert found.sizes[0] == pytest.approx(0.8)

@@ -233,10 +233,10 @@ def range_equations_of(metric: MetricResult) -> Values:
     moved = ranges.moved(on_map.posterior) if on_map.is_at_rest else ranges
     problem = linearized(moved.on(on_map)).with_learnt_errors()
     return {
-        "ranges residual": problem.linear.residual_m,
-        "ranges derivatives": problem.linear.design,
-        "ranges prior residual": problem.linear.prior_residual,
-        "ranges prior derivatives": problem.linear.prior_design,
+        "ranges residual": problem.residual_m,
+        "ranges derivatives": problem.design,
+        "ranges prior residual": problem.prior_residual,
+        "ranges prior derivatives": problem.prior_design,
         "ranges covariance": problem.noise.covariance_m2,
     }
 
@@ -247,8 +247,8 @@ def position_equations_of(metric: MetricResult) -> Values:
     if found is None or not found.is_used:
         return {}
     return {
-        "positions residual": problem.linear.residual_m[problem.rows[POSITIONS]],
-        "positions derivatives": problem.linear.design[problem.rows[POSITIONS]],
+        "positions residual": problem.residual_m[problem.rows[POSITIONS]],
+        "positions derivatives": problem.design[problem.rows[POSITIONS]],
         "positions covariance": problem.noise_of(POSITIONS).covariance_m2,
         "positions weight": found.weights,
     }

@@ -221,7 +221,7 @@ class Known:
         for name in RECEIVERS.keys() & {*self.names}:
             own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])
         covariance = covariance + grouping @ np.kron(own, np.eye(3)) @ grouping.T
-        used, design = problem.is_used, problem.linear.design
+        used, design = problem.is_used, problem.design
         if known.velocity.any():  # the time offset is unknown, too
             design = np.column_stack([design, grouping @ known.velocity.ravel()])
         design = design[used]

@@ -214,7 +214,14 @@ def _keyframes(path: Trajectory, num: int, *, in_site: bool) -> Observations:
     motions = similarity_motions(path.centers[some] - path.centers[0]).reshape(-1, 7)
     none, by_pose = np.zeros(len(motions)), _by_pose(path.world_from_cam[0], some, len(path))
     return Observations(
-        _KEYFRAMES, columns, motions[:, : columns.num], none, by_pose, (), np.diag(none), none.astype(bool)
+        columns,
+        motions[:, : columns.num],
+        none,
+        kind=_KEYFRAMES,
+        by_pose=by_pose,
+        components=(),
+        alone_m2=np.diag(none),
+        is_used=none.astype(bool),
     )
 
 

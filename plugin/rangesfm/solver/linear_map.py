@@ -9,7 +9,7 @@ chi-square distributed with as many degrees of freedom as H has columns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -62,17 +62,17 @@ class LinearMap:
     """Linear equations of c observations and r priors for p unknowns of a map, about the map's state.
 
     Attributes:
-        residual_m: (c,) predicted minus measured, without any bias.
-        design: (c, p) derivatives of the residuals by the unknowns.
-        prior_residual, prior_design: (r,), (r, p) the same for the priors, in standard deviations.
         columns: position of each unknown; the first is the logarithm of the scale.
+        design: (c, p) derivatives of the residuals by the unknowns.
+        residual_m: (c,) predicted minus measured, without any bias.
+        prior_residual, prior_design: (r,), (r, p) the same for the priors, in standard deviations.
     """
 
-    residual_m: Array
-    design: Array
-    prior_residual: Array
-    prior_design: Array
     columns: Columns
+    design: Array
+    residual_m: Array
+    prior_residual: Array = field(default_factory=lambda: np.zeros(0))
+    prior_design: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def residual(self) -> Array:
@@ -82,14 +82,14 @@ class LinearMap:
     @property
     def jacobian(self) -> Array:
         """(c + r, p) derivatives of all residuals."""
-        return np.vstack([self.design, self.prior_design])
+        return np.vstack([self.design, self.prior_design.reshape(-1, self.design.shape[1])])
 
     def with_more(self, unknowns: Sequence[Array]) -> LinearMap:
         """Return the equations with further unknowns, by effects (c, m) on observations, or (c + r, m) on all."""
         num, own = len(self.residual_m), self.jacobian
         effects = (np.pad(each, ((0, len(own) - len(each)), (0, 0))) for each in unknowns)
         columns = np.hstack([own, *effects])
-        return replace(self, design=columns[:num], prior_design=columns[num:])
+        return LinearMap(self.columns, columns[:num], self.residual_m, self.prior_residual, columns[num:])
 
     def solved(self, covariance_m2: Array) -> Solved:
         """Return the solution for residuals with this (c, c) covariance."""

@@ -7,7 +7,7 @@ its own; the bending of the map is that of all.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -28,32 +28,24 @@ GIVEN = "given"
 """Effect of priors; not a component of the noise."""
 
 
-@dataclass(frozen=True)
-class Observations:
+@dataclass(frozen=True, kw_only=True)
+class Observations(LinearMap):
     """c observations of one kind, single ones or means of groups, linearised at a state of a map.
 
     Attributes:
         kind: its name.
-        columns: unknowns on which they depend. design: (c, p) derivatives by these.
-        residual_m: (c,) predicted minus measured.
         by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in the frame and
             in the unit in which ``MapBending`` has the path.
         components: of their errors, without the bending of the map.
         alone_m2: (c, c) covariance as if each single one erred independently.
         is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
-        prior_residual, prior_design: (r,), (r, p) of priors on the unknowns, in standard deviations.
     """
 
     kind: str
-    columns: Columns
-    design: Array
-    residual_m: Array
     by_pose: Array
     components: tuple[Component, ...]
     alone_m2: Array
     is_used: Mask
-    prior_residual: Array = field(default_factory=lambda: np.zeros(0))
-    prior_design: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -152,19 +144,19 @@ class Posterior:
         return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0], best.pulls)
 
 
-@dataclass(frozen=True)
-class JointProblem:
+@dataclass(frozen=True, kw_only=True)
+class JointProblem(LinearMap):
     """The linear equations of all kinds of observations, one below the other, and of the priors.
 
+    Residuals are those of the map as the photos alone would have it.
+
     Attributes:
-        linear: the equations; residuals are those of the map as the photos alone would have it.
         rows: of each kind, by its name.
         components: of the errors. sizes: of these, by name.
         bending: of the map, in all observations.
         alone_m2, is_used: as of ``Observations``.
     """
 
-    linear: LinearMap
     rows: Mapping[str, slice]
     components: tuple[Component, ...]
     sizes: Mapping[str, float]
@@ -198,7 +190,7 @@ class JointProblem:
     def size_of(self, kind: str) -> Array:
         """Return the column (c, 1) of a mistake by which all observations of a kind have the map too small."""
         column = np.zeros((len(self.is_used), 1))
-        column[self.rows[kind], 0] = self.linear.design[self.rows[kind], self.linear.columns.scale]
+        column[self.rows[kind], 0] = self.design[self.rows[kind], self.columns.scale]
         return column
 
     def noise_of(self, kind: str) -> Noise:
@@ -231,7 +223,7 @@ class JointProblem:
         """
         if self.bending.given_sizes is not None:
             return self
-        used, linear, widened = self.is_used, self.linear, self.linear.with_more(mistakes)
+        used, widened = self.is_used, self.with_more(mistakes)
         # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
         num_kinds = sum(used[rows].any() for rows in self.rows.values())
         most_bent = min(most_bent, SIGNIFICANT_STDDEVS) if num_kinds > 1 else most_bent
@@ -244,7 +236,7 @@ class JointProblem:
             )
         sizes = learnt_sizes(
             components,
-            -linear.residual_m[used],
+            -self.residual_m[used],
             widened.design[used],
             widened.prior_design,
             {name: most_bent if name in BENDS else most_unusual for name in self.sizes},
@@ -254,8 +246,8 @@ class JointProblem:
 
     def among(self, rows: Mask) -> tuple[LinearMap, Noise]:
         """Return the equations and the errors of some of the observations."""
-        linear = replace(self.linear, residual_m=self.linear.residual_m[rows], design=self.linear.design[rows])
-        return linear, self.noise.of_rows(rows)
+        priors = self.prior_residual, self.prior_design
+        return LinearMap(self.columns, self.design[rows], self.residual_m[rows], *priors), self.noise.of_rows(rows)
 
     def mistake(self, columns: Array) -> EstimatedMistake:
         """Estimate a mistake that changes what is measured by (c, m) ``columns`` times its m numbers.
@@ -281,10 +273,10 @@ class JointProblem:
         Args:
             covariance: (p, p) of the unknowns.
         """
-        used, rows, linear, noise_m2 = self.is_used, self.rows[kind], self.linear, self.noise.covariance_m2
+        used, rows, noise_m2 = self.is_used, self.rows[kind], self.noise.covariance_m2
         across = noise_m2[rows][:, used]
         factor = cho_factor(regular(noise_m2[np.ix_(used, used)]))
-        left = linear.design[rows] - across @ cho_solve(factor, linear.design[used])
+        left = self.design[rows] - across @ cho_solve(factor, self.design[used])
         return np.asarray(noise_m2[rows, rows] - across @ cho_solve(factor, across.T) + left @ covariance @ left.T)
 
 
@@ -304,21 +296,18 @@ def joined(observations: Sequence[Observations], bending: MapBending) -> JointPr
     bent = bending.of_functions(np.vstack([each.by_pose for each in observations]), frame_is_free=columns.frame >= 0)
     own = (part.among(rows[each.kind], num) for each in observations for part in each.components)
     components = (*own, *bent.parts)
-    linear = LinearMap(
-        np.concatenate([each.residual_m for each in observations]) + bent.shift_m,
+    return JointProblem(
+        columns,
         np.vstack([_in_columns(each.design, each.columns, columns) for each in observations]),
+        np.concatenate([each.residual_m for each in observations]) + bent.shift_m,
         np.concatenate([each.prior_residual for each in observations]),
         np.vstack([_in_columns(each.prior_design, each.columns, columns) for each in observations]),
-        columns,
-    )
-    return JointProblem(
-        linear,
-        rows,
-        components,
-        usual_sizes(components, bent.given_sizes or {}),
-        bent,
-        np.asarray(block_diag(*(each.alone_m2 for each in observations))),
-        np.concatenate([each.is_used for each in observations]),
+        rows=rows,
+        components=components,
+        sizes=usual_sizes(components, bent.given_sizes or {}),
+        bending=bent,
+        alone_m2=np.asarray(block_diag(*(each.alone_m2 for each in observations))),
+        is_used=np.concatenate([each.is_used for each in observations]),
     )
 
 

@@ -87,8 +87,16 @@ def other(kind: str, longer: float = 0.0, stddev: float = 0.01) -> Observations:
     """Another kind of measurement, by which the map is larger than it is."""
     nothing, one = np.zeros(0, dtype=np.int64), np.array([[stddev**2]])
     columns, used = Columns(0, -1, nothing, nothing, 1), np.ones(1, dtype=bool)
-    still = np.zeros((1, 6 * NUM))
-    return Observations(kind, columns, np.ones((1, 1)), np.array([-longer]), still, (Component(kind, one),), one, used)
+    return Observations(
+        columns,
+        np.ones((1, 1)),
+        np.array([-longer]),
+        kind=kind,
+        by_pose=np.zeros((1, 6 * NUM)),
+        components=(Component(kind, one),),
+        alone_m2=one,
+        is_used=used,
+    )
 
 
 @pytest.mark.parametrize("median", [0.0001, 0.01])

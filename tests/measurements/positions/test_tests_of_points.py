@@ -46,14 +46,14 @@ class Held(KindOnMap):
         turn, first_m = Rotation.from_matrix(placed.rotation).as_rotvec(), PATH.centers[:1]
         none, covariance = np.zeros(0, dtype=np.int64), self.stddev**2 * np.eye(7)
         return Observations(
-            self.kind,
             Columns(0, 1, none, none, 7),
             np.eye(7),
             np.array([np.log(placed.scale), *turn, *(placed.apply(first_m) - first_m)[0]]),
-            np.zeros((7, 18)),
-            (Component("held", covariance),),
-            covariance,
-            np.ones(7, dtype=bool),
+            kind=self.kind,
+            by_pose=np.zeros((7, 18)),
+            components=(Component("held", covariance),),
+            alone_m2=covariance,
+            is_used=np.ones(7, dtype=bool),
         )
 
 

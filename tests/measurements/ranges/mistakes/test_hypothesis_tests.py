@@ -37,11 +37,11 @@ def hypotheses(problem: Linearized) -> list[Hypothesis]:
 def with_mistake(problem: Linearized, mistake: Array) -> Linearized:
     """The problem without noise, with the effect of a mistake (c + r,) on bins and priors."""
     num = len(problem.bins)
-    return replace(problem, linear=replace(problem.linear, residual_m=mistake[:num], prior_residual=mistake[num:]))
+    return replace(problem, residual_m=mistake[:num], prior_residual=mistake[num:])
 
 
 def without_noise(problem: Linearized) -> Linearized:
-    return with_mistake(problem, np.zeros(len(problem.bins) + len(problem.linear.prior_residual)))
+    return with_mistake(problem, np.zeros(len(problem.bins) + len(problem.prior_residual)))
 
 
 def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> None:
@@ -117,7 +117,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
     monkeypatch.setattr(hypothesis_tests, "_thresholds", lambda *_: thresholds)
     alarms = 0
     for _ in range(num):
-        num_priors = len(problem.linear.prior_residual)
+        num_priors = len(problem.prior_residual)
         off = np.append(factor @ rng.standard_normal(len(factor)), rng.standard_normal(num_priors))
         drawn = with_mistake(problem, off)
         tests = Factorization(drawn).test(tried, 0)

@@ -128,8 +128,8 @@ class TestDerivatives:
             moved = replace(on_map, state=state_after((problem.columns,), on_map.state, x))
             return problem.bins.mean(moved.residual_m)
 
-        np.testing.assert_allclose(problem.linear.design, slopes(residual_m, problem.columns.num), atol=1e-7)
-        np.testing.assert_allclose(problem.linear.residual_m, 0.0, atol=1e-12)
+        np.testing.assert_allclose(problem.design, slopes(residual_m, problem.columns.num), atol=1e-7)
+        np.testing.assert_allclose(problem.residual_m, 0.0, atol=1e-12)
 
     @pytest.mark.parametrize("frame_is_free", [True, False])
     def test_the_path_moves_with_the_map(self, frame_is_free: bool) -> None:

@@ -351,10 +351,10 @@ def _place_m(located: Linearized, k: int) -> Array:
 
 def _bias(located: Linearized, k: int) -> tuple[float, float]:
     """Return the bias of an anchor's ranges from its prior mean, and its standard deviation, metres."""
-    solved = located.linear.solved(located.noise.covariance_m2)
+    solved = located.solved(located.noise.covariance_m2)
     stddev_m = float(located.on_map.problem.bias_stddev_m[k])
     of_bins = stddev_m**2 * (located.bins.anchor_index == k)
-    of_all = np.append(of_bins, np.zeros(len(located.linear.prior_residual)))
+    of_all = np.append(of_bins, np.zeros(len(located.prior_residual)))
     left = solved.left(solved.whitened(of_all[:, None]))[:, 0]
     return -float(left @ solved.residual), float(np.sqrt(np.maximum(stddev_m**2 - left @ left, 0.0)))
 
@@ -367,7 +367,7 @@ def _covariance(located: Linearized, k: int) -> Array:
     misfit is higher by that of one standard deviation.
     """
     noise_m2, own = located.noise.covariance_m2, located.columns.anchor[k] + np.arange(3)
-    whole = located.linear.solved(noise_m2).covariance
+    whole = located.solved(noise_m2).covariance
     covariance: Array = whole[np.ix_(own, own)]
     variances, axes = np.linalg.eigh(covariance)
     along, problem = axes[:, 2], located.on_map.problem
@@ -379,8 +379,7 @@ def _covariance(located: Linearized, k: int) -> Array:
     free = null_space(held)
 
     def solved(at: Linearized) -> Solved:
-        linear = at.linear
-        return replace(linear, design=linear.design @ free, prior_design=linear.prior_design @ free).solved(noise_m2)
+        return Solved(noise_m2, at.jacobian @ free, at.residual)
 
     def misfit(distance_m: float) -> float:
         """Return the misfit at a distance along the direction, with all else adapted."""

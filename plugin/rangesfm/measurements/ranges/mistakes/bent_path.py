@@ -92,7 +92,7 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     moved, stddevs_m = problem.after_step(), problem.noise.stddev_of_component
-    pulls = cho_solve(cho_factor(regular(problem.noise.covariance_m2)), moved.linear.residual_m)
+    pulls = cho_solve(cho_factor(regular(problem.noise.covariance_m2)), moved.residual_m)
     by_pose = problem.bins.by_pose(on_map.by_poses, len(walk.path))
     sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.components if part.name in BENDS}
     bent = walk.bent_back(pulls @ by_pose, sizes, frame_is_free=is_free)

@@ -115,7 +115,7 @@ class Hypothesis:
 def of_bins(problem: Linearized, columns: Array) -> Array:
     """Return the (c + r, k) effects of (c, k) or (c,) effects on the bins alone, without a part in the priors."""
     columns = columns.reshape(len(problem.bins), -1)
-    return np.pad(columns, ((0, len(problem.linear.prior_residual)), (0, 0)))
+    return np.pad(columns, ((0, len(problem.prior_residual)), (0, 0)))
 
 
 def is_given(problem: Linearized, anchor: int) -> bool:

@@ -66,7 +66,7 @@ class Factorization(Solved):
     """The solution of a problem, with the tests of all mistakes in it."""
 
     def __init__(self, problem: Linearized):
-        super().__init__(problem.noise.covariance_m2, problem.linear.jacobian, problem.linear.residual)
+        super().__init__(problem.noise.covariance_m2, problem.jacobian, problem.residual)
         self.problem = problem
         # Quadratic form of the path's mean square displacement in the unknowns.
         place = problem.place.reshape(-1, problem.columns.num)

@@ -17,7 +17,6 @@ from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
-from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.posterior import JointProblem, joined
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
@@ -40,7 +39,7 @@ _MOST_MISREAD = 4.0
 _WANDERING_M = 0.025
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Linearized(JointProblem):
     """The linear problem of ranges in c bins alone, and of r priors; the anchors' biases are random errors.
 
@@ -54,11 +53,6 @@ class Linearized(JointProblem):
     on_map: RangesOnMap
     bins: RangeBins
     scatter_m: float
-
-    @property
-    def columns(self) -> Columns:
-        """The p unknowns."""
-        return self.linear.columns
 
     @cached_property
     def time_s(self) -> Array:
@@ -101,9 +95,8 @@ class Linearized(JointProblem):
         A radio that errs by significantly more than others was mistaken, which must not pass for noise. A map may bend
         by any amount. Residuals are taken where those of the priors are smallest, with the map as it is.
         """
-        linear = self.linear
-        back = np.linalg.lstsq(linear.prior_design, linear.prior_residual, rcond=ROUNDING)[0]
-        there = replace(self, linear=replace(linear, residual_m=linear.residual_m - linear.design @ back))
+        back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=ROUNDING)[0]
+        there = replace(self, residual_m=self.residual_m - self.design @ back)
         return replace(self, sizes=there.learnt(*mistakes, most_unusual=SIGNIFICANT_STDDEVS, near=near).sizes)
 
     def with_usual_errors(self) -> Linearized:
@@ -119,7 +112,7 @@ class Linearized(JointProblem):
         """Linearise at another state or for corrected ranges, with the same bins and errors."""
         linear = on_map.linearized(self.bins)
         linear = replace(linear, residual_m=linear.residual_m + self.bending.shift_m)
-        return replace(self, linear=linear, on_map=on_map)
+        return replace(self, **vars(linear), on_map=on_map)
 
     def at_other_map(self, on_map: RangesOnMap) -> Linearized:
         """Linearise the same ranges on another map, in the same bins, with the usual errors."""
@@ -131,10 +124,10 @@ class Linearized(JointProblem):
         A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height
         above a flat path. So a step that makes the state less likely is halved.
         """
-        solved = self.linear.solved(self.noise.covariance_m2)
+        solved = self.solved(self.noise.covariance_m2)
 
         def cost(of: Linearized) -> float:
-            return float(np.sum(solved.whitened(of.linear.residual[:, None]) ** 2))
+            return float(np.sum(solved.whitened(of.residual[:, None]) ** 2))
 
         step, before = solved.step, cost(self)
         for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):
@@ -156,7 +149,7 @@ class Linearized(JointProblem):
     @property
     def misfit(self) -> float:
         """Squared residuals that the unknowns leave, in standard deviations, with those of the priors."""
-        left = self.linear.solved(self.noise.covariance_m2).residual
+        left = self.solved(self.noise.covariance_m2).residual
         return float(left @ left)
 
 

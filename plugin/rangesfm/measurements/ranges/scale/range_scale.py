@@ -199,7 +199,7 @@ class RangeScale(KindOnMap):
         if not drifts(problem):
             return
         weights, rows = problem.bins.robust_weight, self.solved.posed.rows
-        known = Posterior.best(problem.linear, problem.noise, on_map.posterior.uncertainty.formal)
+        known = Posterior.best(problem, problem.noise, on_map.posterior.uncertainty.formal)
         solved = replace(self.solved, state=bent.state, weights=weights)
         status, stddev_m = told.observations.status.copy(), told.errors.stddev_m.copy()
         status[rows], stddev_m[rows] = status_by_weight(weights), problem.scatter_m
