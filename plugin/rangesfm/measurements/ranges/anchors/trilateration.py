@@ -1,8 +1,8 @@
 """Trilateration: positions of anchors from ranges at known positions of the tag.
 
 It is the estimate of a run with the path held: the same robust fit, errors and best weights (sections 4 to 7 of
-``model.md``). The errors are learnt from the ranges to all anchors together. Lee, Zhu, Giorgi and Günther (2018) begin
-with it, too.
+``model.md``). The errors are learnt from the ranges to all anchors together, or to each that has many. Lee, Zhu, Giorgi
+and Günther (2018) begin with it, too.
 """
 
 from __future__ import annotations
@@ -282,18 +282,21 @@ def _located(posed: ScaleProblem) -> Iterator[tuple[int, Linearized, RangesOnMap
     state = RangeState(IDENTITY, np.zeros((problem.num_anchors, 3)), problem.bias_mean_m.copy())
     noise_m = np.where(before.is_estimated, START_STDDEV_M, before.given_m)
     for k in np.unique(problem.anchor_index):
-        own = problem.anchor_index == k
-        found = likeliest_state(problem.of_anchor(k), noise_m[own], before.shared_m[own])
+        rows = problem.anchor_index == k
+        found = likeliest_state(problem.of_anchor(k), noise_m[rows], before.shared_m[rows])
         state.anchors_m[k], state.bias_m[k] = found.anchors_m[0], found.bias_m[0]
     fitted, index = solution_from(posed, state), problem.anchor_index
-    sizes = _in_bins(fitted).learnt().sizes
+    together = _in_bins(fitted).learnt()
     for k in np.unique(index).tolist():
         # As many bins for each anchor as for all: in those of all, what tells the places would be averaged away over a
         # long log. The others are held.
         is_own = np.arange(problem.num_anchors) == k
         alone = replace(problem, anchor_stddev_m=np.where(is_own, problem.anchor_stddev_m, 0.0))
-        of_one = replace(fitted.with_problem(alone), weights=np.where(index == k, fitted.weights, 0.0))
-        yield k, replace(_in_bins(of_one), sizes=sizes).settled(fitted.state), fitted
+        own = _in_bins(replace(fitted.with_problem(alone), weights=np.where(index == k, fitted.weights, 0.0)))
+        # So would errors that last for seconds, which bins of its own show, if there are about as many of them.
+        shows = 2 * len(own.bins) > len(together.bins)
+        own = own.learnt(near=together.sizes) if shows else replace(own, sizes=together.sizes)
+        yield k, own.settled(fitted.state), fitted
 
 
 def _in_bins(on_map: RangesOnMap) -> Linearized:
