@@ -120,12 +120,12 @@ def test_a_bag_with_images_is_photos_and_what_a_run_took_out_of_it_is_not(tmp_pa
 
 
 def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -> None:
-    (tmp_path / "unknown.csv").write_text("a,b,c\n0.1,2.5,3.5\n0.2,2.6,3.7\n0.3,2.7,3.8\n")
+    (tmp_path / "my log.csv").write_text("a,b,c\n0.1,2.5,3.5\n0.2,2.6,3.7\n0.3,2.7,3.8\n")
     (note,) = look_into([tmp_path]).notes
     assert "not known for sure" in note
-    assert f"rangesfm ranges {tmp_path / 'unknown.csv'} says what is missing" in note
+    assert f"rangesfm ranges '{tmp_path / 'my log.csv'}' says what is missing" in note
     (tmp_path / "uwb.csv").write_text(CONTENTS["ranges.path"])
-    assert look_into([tmp_path]).notes == ("not used: unknown.csv (a table whose columns are not known for sure)",)
+    assert look_into([tmp_path]).notes == ("not used: my log.csv (a table whose columns are not known for sure)",)
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Files that cannot be used are listed, too, each with the reason.
 from __future__ import annotations
 
 import os
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext, suppress
@@ -153,7 +154,8 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
         like_anchors = {path: why for why, those in unused.items() for path in those if is_about_anchors(path)}
     if LOG not in paths:
         for path in [*unsure][:_MAX_NUM_UNSURE]:
-            notes.append(f"{unsure.pop(path)}; if it is the radio's log, rangesfm ranges {path} says what is missing")
+            command = shlex.join(["rangesfm", "ranges", str(path)])
+            notes.append(f"{unsure.pop(path)}; if it is the radio's log, {command} says what is missing")
     unused["a table whose columns are not known for sure"] += unsure
     notes += [f"not used: {_listed(those, folders)} ({reason})" for reason, those in unused.items() if those]
     found = {key: those for key, those in paths.items() if those}

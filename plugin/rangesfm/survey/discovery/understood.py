@@ -97,9 +97,9 @@ def understand(
     if found.models and PHOTOS not in values:
         values.setdefault(MODEL, found.models[0])
     notes += [
-        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} starts from it"
+        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {shlex.quote(str(path))} starts from it"
         if path.is_dir()
-        else f"{path} is a trajectory: rangesfm scale SURVEY --input_path {path} scales it"
+        else f"{path} is a trajectory: rangesfm scale SURVEY --input_path {shlex.quote(str(path))} scales it"
         for path in found.models
         if path != values.get(MODEL)
     ]
