@@ -148,7 +148,7 @@ def refusal(own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: py
         (set_line("images.csv", 4, "frame_00003.jpg,x"), r"/images.csv:4: timestamp_s is 'x', expected a time in s"),
         (
             write("images.csv", "image_name,timestamp_s\nother.jpg,1\n"),
-            r"/images.csv: none of the model's photos has a time, the first is frame_00001.jpg",
+            r"/images.csv: none of the photos has a time, the first is frame_00001.jpg",
         ),
         (set_line("reference.csv", 5, "frame_00004.jpg,1,b,2"), r"/reference.csv:5: y_m is 'b', expected a number"),
         (

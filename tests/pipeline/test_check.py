@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from tests.simulated.files import write_rows
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
+from tests.simulated.surveys import model_of_poses
 
 from rangesfm.pipeline.check import check_survey
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import survey_from_tables
+from rangesfm.util.geometry.trajectory import Trajectory
 
 PHONE_START_S = 1777888800.0  # 2026-05-04 10:00:00 UTC
 
@@ -83,6 +87,23 @@ def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_fa
     assert without_photos.facts[0].startswith("ranges: 60 of 1 tag")
     faults = check_survey(survey_from_tables({}, folder)).faults
     assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]
+
+
+def test_the_times_of_a_model_are_those_of_its_photos(folder: Path) -> None:
+    at = np.arange(20.0)
+    names = tuple(f"{k}.jpg" for k in range(20))
+    centers_m = np.column_stack([at, np.sin(at), np.zeros(20)])
+    path = Trajectory(np.arange(1, 21), names, at, centers_m, np.tile(np.eye(3), (20, 1, 1)))
+    (folder / "sparse").mkdir()
+    model_of_poses(path).write(folder / "sparse")
+    timed = [*zip(names[:15], at + PHONE_START_S), ("of another walk.jpg", PHONE_START_S + 1000)]
+    write_rows(folder / "times.csv", "image_name,timestamp_s", timed)
+    model = {"images.model": folder / "sparse", "images.times": folder / "times.csv", "ranges.path": folder / "uwb.csv"}
+    checked = check_survey(survey_from_tables({}, folder, model))
+    assert any("15 of 20 keyframes from 2026-05-04 10:00:00.000 to 10:00:14.000" in fact for fact in checked.facts)
+    write_rows(folder / "times.csv", "image_name,timestamp_s", timed[15:])
+    (fault,) = check_survey(survey_from_tables({}, folder, model)).faults
+    assert "none of the photos has a time, the first is 0.jpg" in str(fault)
 
 
 def test_masks_a_database_and_options_of_colmap_are_looked_at(folder: Path) -> None:

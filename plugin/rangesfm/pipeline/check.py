@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,7 +13,13 @@ import numpy as np
 
 from rangesfm.errors import RangesfmError
 from rangesfm.measurements.ranges.range_log import RangeKind
-from rangesfm.pipeline.map_photos import begin_run, check_taped_ends, read_registered, with_keyframes
+from rangesfm.pipeline.map_photos import (
+    begin_run,
+    check_taped_ends,
+    read_registered,
+    with_keyframes,
+    with_times_of_model,
+)
 from rangesfm.progress import SILENT, Journal
 from rangesfm.sfm.camera import cameras_of_photos, check_camera
 from rangesfm.sfm.features import feature_options
@@ -23,7 +29,6 @@ from rangesfm.sfm.matching import matching_options
 from rangesfm.sfm.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.source import is_source, open_source
 from rangesfm.survey.survey_run import SurveyRun
@@ -86,14 +91,15 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             return checked
         if model is None:
             run, keyframes = with_keyframes(run)
+            num_keyframes = len(keyframes)
         else:
             sfm = read_registered(model, journal)
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
             keyframes = tuple(image.name for image in sfm.images.values())
-            if inputs.needs_times:
-                run = replace(run, times=times_of_model(survey, sfm, model))
+            num_keyframes = sfm.num_reg_frames()
+            run = with_times_of_model(run, sfm)
             check_taped_ends(run.with_photos(keyframes, "the map"), keyframes)
-        _tell_of_times(run, len(keyframes), checked)
+        _tell_of_times(run, num_keyframes, checked)
         if photos is not None:
             _check_mapper(survey, photos.subset(keyframes), checked)
     return checked
@@ -196,9 +202,10 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
 
 def _tell_of_times(run: SurveyRun, num_keyframes: int, checked: CheckedSurvey) -> None:
     times, moments, num = run.times, run.inputs.log.moments, len(run.inputs.log)
+    timed = num_keyframes if times is None or len(times) == num_keyframes else f"{len(times)} of {num_keyframes}"
     if times is not None and isinstance(moments, ByPhoto):
         first_s, last_s = times.timestamps_s[[0, -1]]
-        checked.facts.append(f"times: {num_keyframes} keyframes from {span_text(first_s, last_s)} ({times.source})")
+        checked.facts.append(f"times: {timed} keyframes from {span_text(first_s, last_s)} ({times.source})")
         return
     if times is None:
         why = "the ranges name their photos" if num else "there are no ranges"
@@ -206,7 +213,7 @@ def _tell_of_times(run: SurveyRun, num_keyframes: int, checked: CheckedSurvey) -
         return
     radio_s, photos_s, offset_s = moments.timestamp_s, times.timestamps_s, run.survey.ranges.time_offset_s
     checked.facts.append(
-        f"times: {num_keyframes} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
+        f"times: {timed} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
         f"ranges from {span_text(radio_s.min(), radio_s.max())}"
     )
     at_s = radio_s + (offset_s or 0.0)

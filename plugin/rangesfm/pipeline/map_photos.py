@@ -36,6 +36,7 @@ from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
 from rangesfm.sfm.tags import find_tags, names_of_tags, sides_of_tags
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
 from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.survey.sources.source import is_source
@@ -108,6 +109,20 @@ def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
     """Check that the ends of taped distances are among these photos, markers, tags or anchors; raises InputError."""
     may_be_tags = run.survey.markers.dictionary is not None
     check_ends(run.inputs.tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
+
+
+def with_times_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyRun:
+    """Return the survey with the times of the photos of its model, if any are needed.
+
+    Raises:
+        InputError: no photo has a time, or times are wrong.
+    """
+    if not run.inputs.needs_times:
+        return run
+    times = times_of_model(run.survey, sfm, run.survey.given_model_path)
+    run.journal.note(*times.assumed)
+    run.journal.warn(*times.notes)
+    return with_times(run, times)
 
 
 def with_times(run: SurveyRun, times: ImageTimes) -> SurveyRun:

@@ -25,13 +25,10 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
         models: unscaled models of its photos.
 
     Raises:
-        InputError: times are needed and no photo of the first model has one, or reference or ranges do not fit it.
+        InputError: reference or ranges do not fit the first model.
         GeometryError: the ranges do not determine the time offset.
     """
     trajectory = _path_of_model(run, models[0])
-    if not len(trajectory):
-        first = min(image.name for image in models[0].images.values())
-        raise InputError(f"none of the model's photos has a time, the first is {first}", run.survey.images.times)
     num = models[0].num_reg_frames()
     if num_without_time := num - len(trajectory):
         run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")

@@ -29,7 +29,7 @@ from rangesfm.pipeline.map_photos import (
     with_keyframes,
     with_photos_in_folder,
     with_tags,
-    with_times,
+    with_times_of_model,
 )
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.place_ranges import place_ranges
@@ -38,7 +38,6 @@ from rangesfm.pipeline.run_results import RunResult, write_results
 from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.rigs import read_rigs
-from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.files.atomic import sole_writer
@@ -133,11 +132,7 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
         sfm: its model.
         refine: whether to refine the map after scaling it.
     """
-    if run.inputs.needs_times:
-        times = times_of_model(run.survey, sfm, run.survey.given_model_path)
-        run.journal.note(*times.assumed)
-        run.journal.warn(*times.notes)
-        run = with_times(run, times)
+    run = with_times_of_model(run, sfm)
     names = sorted(image.name for image in sfm.images.values())
     run = with_tags(run.with_photos(names, "the map"), names)
     return map_in_metres(run, place_ranges(run, [sfm]), refine=refine)

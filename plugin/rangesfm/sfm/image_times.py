@@ -158,7 +158,8 @@ def read_image_times_csv(
     Args:
         names: the existing photos; None: the names in the file are not checked.
         frames: groups of photos taken at once, each by the name of the photo among ``names`` that stands for it and
-            belongs to it. A group gets the time of its first photo that has one.
+            belongs to it. A group gets the time of its first photo that has one. Without ``names``, only groups get
+            times.
         columns, unit: as for ``read_photo_list``.
 
     Raises:
@@ -169,9 +170,8 @@ def read_image_times_csv(
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
     image_names = photos_meant(table.text("image_name"), {*(names or ()), *frame_of})
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
-    known, unknown = set(image_names), list[int]()
+    known, unknown = {*(names or ()), *frame_of} or set(image_names), list[int]()
     if names is not None:
-        known = {*names, *frame_of}
         unknown = [row for row, name in enumerate(image_names) if name not in known]
         timed = set(image_names)
         # If every photo has a time, the unknown names belong to photos that were removed. If one has none, an unknown
@@ -186,6 +186,8 @@ def read_image_times_csv(
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
         first: stamps[own[0]] for first, photos in frames.items() if (own := [p for p in photos if p in stamps])
     }
+    if not stamps:
+        raise InputError(f"none of the photos has a time, the first is {min(known)}", path)
     ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
     notes = []
     if unknown:
