@@ -13,6 +13,31 @@ from rangesfm.util.geometry.trajectory import OnPath, Trajectory
 
 
 @dataclass(frozen=True)
+class PlacesOnPath(OnPath):
+    """Places of an antenna at n moments on the path of an unscaled model.
+
+    The antenna is at ``centers + tag_from_center``, with both vectors in the axes of the model's world. The centres are
+    in the world's unit, and the lever arm is in metres, so that a similarity scales the centres and never the lever
+    arm. Centres are ``(1 - fraction) * c_before + fraction * c_after + center_offsets``. The offset is the deviation of
+    a curved path from the straight line.
+
+    Attributes:
+        centers: (n, 3) camera centres in model units; NaN without a place.
+        center_offsets: (n, 3) deviation from the straight line, in model units.
+        tag_from_center: (n, 3) lever arm in the axes of the world, metres.
+        center_stddev: (n,) standard deviation of each coordinate of the interpolated centre, model units. At a keyframe
+            with an exact time it is the keyframes' own error, as far as keyframes close in time show one.
+        arm_stddev_m: (n,) standard deviation of each coordinate of the lever arm, metres.
+    """
+
+    centers: Array
+    center_offsets: Array
+    tag_from_center: Array
+    center_stddev: Array
+    arm_stddev_m: Array
+
+
+@dataclass(frozen=True)
 class AntennaPlaces(OnPath):
     """Places of an antenna at n times.
 

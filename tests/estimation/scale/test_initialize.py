@@ -476,7 +476,7 @@ def no_ranges() -> RangeObservations:
     none, no, nowhere = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
     log = RangeLog((), none, no, ByPhoto(()), no, no, (), none, none, np.zeros(0, dtype=np.int8), none)
     status = np.zeros(0, dtype=np.int8)
-    return RangeObservations(log, status, none, none, no, nowhere, nowhere, nowhere, no, no)
+    return RangeObservations(none, none, no, nowhere, nowhere, nowhere, no, no, log, status)
 
 
 def turned_path() -> Trajectory:

@@ -109,7 +109,7 @@ def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: Range
     for own_m, arm_m in zip(arms_m, antennas_in_cam_m, strict=True):
         own = np.tile(arm_m, (num_known, 1))
         places = places_on_path(trajectory, own, at.subset(is_known), time_resolution_s=0.0, options=options)
-        centers[is_known], own_m[is_known] = places.centers, places.arms_m
+        centers[is_known], own_m[is_known] = places.centers, places.tag_from_center
     return PathSamples(start_s, step_s, centers, arms_m, is_known)
 
 

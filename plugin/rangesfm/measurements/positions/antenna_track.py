@@ -72,7 +72,7 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     moments = track.log.moments
     names = moments.image_name if isinstance(moments, ByPhoto) else [*map(time_text, moments.timestamp_s.tolist())]
     interval_s = np.zeros(k) if times_s is None else times_s[at.after] - times_s[at.before]
-    places = AntennaPlaces(at.before, at.after, at.fraction, interval_s, on_path.offsets)
+    places = AntennaPlaces(at.before, at.after, at.fraction, interval_s, on_path.center_offsets)
     parts = places.by_pose(Poses(path.world_from_cam, path.centers), arms_m, np.tile(np.eye(3), (k, 1, 1)))
     return KnownPositions(
         names=tuple(names[row] for row in rows.tolist()),
@@ -81,8 +81,8 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         position_m=track.log.position_m[rows],
         covariance_m2=track.log.covariance_m2[rows],
         places=on_path.centers,
-        arms_m=on_path.arms_m,
-        own_covariance=on_path.stddev[:, None, None] ** 2 * np.eye(3),
+        arms_m=on_path.tag_from_center,
+        own_covariance=on_path.center_stddev[:, None, None] ** 2 * np.eye(3),
         arm_stddev_m=on_path.arm_stddev_m,
         time_s=at_s,
         velocity=velocity,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.measurements.places import PlacesOnPath
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.options import RangesOptions
@@ -72,45 +71,17 @@ def associate(
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)
     status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
     status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
-    placed = status == RangeStatus.USED
-    at = at.moved(~placed, -1)
+    at = at.moved(status != RangeStatus.USED, -1)
     # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
-    centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
-    offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
-    on_path = places_on_path(
-        trajectory,
-        tags_in_cam_m[placed],
-        at.subset(placed),
-        time_resolution_s=log.time_resolution_s,
-        options=options,
-    )
-    centers[placed], offsets[placed], stddev[placed] = on_path.centers, on_path.offsets, on_path.stddev
-    lever[placed], arm_stddev_m[placed] = on_path.arms_m, on_path.arm_stddev_m
-    on_keyframes = (at.before, at.after, at.fraction)
-    return RangeObservations(log, status, *on_keyframes, centers, offsets, lever, stddev, arm_stddev_m)
+    resolution_s = log.time_resolution_s
+    places = places_on_path(trajectory, tags_in_cam_m, at, time_resolution_s=resolution_s, options=options)
+    return RangeObservations(**vars(places), log=log, status=status)
 
 
 def is_too_long(gaps_s: npt.ArrayLike, options: RangesOptions) -> Mask:
     """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
     return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
-
-
-@dataclass(frozen=True)
-class PlacesOnPath:
-    """Places of n moments on a camera's path.
-
-    Attributes:
-        centers: (n, 3) of the camera. offsets: (n, 3) of these from the straight lines between keyframes. stddev: (n,)
-            of each coordinate. All in model units.
-        arms_m: (n, 3) lever arms in the axes of the model's world. arm_stddev_m: (n,) of each coordinate.
-    """
-
-    centers: Array
-    offsets: Array
-    stddev: Array
-    arms_m: Array
-    arm_stddev_m: Array
 
 
 def places_on_path(
@@ -124,19 +95,22 @@ def places_on_path(
     """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
 
     Args:
-        arms_in_cam_m: (n, 3) lever arms. at: all have a place.
+        arms_in_cam_m: (n, 3) lever arms. at: -1 for a moment without a place.
         time_resolution_s: step to which the moments were rounded.
     """
-    num = len(arms_in_cam_m)
+    rows, num = np.flatnonzero(at.before >= 0), len(at.before)
+    own, arms_m = at.subset(rows), np.full((num, 3), np.nan)
+    centers, offsets, stddev, arm_stddev_m = arms_m.copy(), np.zeros((num, 3)), np.zeros(num), np.zeros(num)
     if trajectory.timestamps_s is None or len(trajectory) < 2:
-        arms_m = np.einsum("nij,nj->ni", trajectory.world_from_cam[at.before], arms_in_cam_m)
-        offsets, stddev, arm_stddev_m = np.zeros((num, 3)), np.zeros(num), np.zeros(num)
+        arms_m[rows] = np.einsum("nij,nj->ni", trajectory.world_from_cam[own.before], arms_in_cam_m[rows])
     else:
         is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
-        arms_m, arm_stddev_m = _interpolated_lever_arms(trajectory, arms_in_cam_m, at, is_bridged)
-        offsets, stddev = _interpolated_centers(trajectory, at, is_bridged)
-        stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, at, options))
-    return PlacesOnPath(at.between(trajectory.centers) + offsets, offsets, stddev, arms_m, arm_stddev_m)
+        arms_m[rows], arm_stddev_m[rows] = _interpolated_lever_arms(trajectory, arms_in_cam_m[rows], own, is_bridged)
+        offsets[rows], own_stddev = _interpolated_centers(trajectory, own, is_bridged)
+        stddev[rows] = np.hypot(own_stddev, _timing_stddev(time_resolution_s, trajectory, own, options))
+    centers[rows] = own.between(trajectory.centers) + offsets[rows]
+    on_keyframes = (at.before, at.after, at.fraction)
+    return PlacesOnPath(*on_keyframes, centers, offsets, arms_m, stddev, arm_stddev_m)
 
 
 def _places_by_time(log: RangeLog, times: Array, keyframe_times: Array, options: RangesOptions) -> OnPath:

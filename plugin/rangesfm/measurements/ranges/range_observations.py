@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.measurements.places import PlacesOnPath
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import OnPath
 
 
 class RangeStatus(IntEnum):
@@ -43,39 +43,17 @@ USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 
 
 @dataclass(frozen=True)
-class RangeObservations:
+class RangeObservations(PlacesOnPath):
     """n ranges (all of the log, in its order) on the path of one model.
-
-    The antenna of range i is at ``centers[i] + tag_from_center[i]``, with both vectors in the axes of the model's
-    world. The centres are in the world's unit, and the lever arm is in metres, so that a similarity scales the centres
-    and never the lever arm. Centres are interpolated between the keyframes ``before`` and ``after``:
-    ``(1 - fraction) * c_before + fraction * c_after + center_offsets``. The offset is the deviation of a curved path
-    from the straight line.
 
     Attributes:
         log: the ranges.
         status: (n,) RangeStatus.
-        before, after: (n,) int, indices of keyframes in the trajectory; -1 without a position on the path.
-        fraction: (n,) place between the two keyframes, from 0 (before) to 1 (after).
-        centers: (n, 3) camera centres in model units; NaN without a position.
-        center_offsets: (n, 3) deviation from the straight line, in model units.
-        tag_from_center: (n, 3) lever arm in the axes of the world, metres.
-        center_stddev: (n,) standard deviation of each coordinate of the interpolated centre, model units. At a keyframe
-            with an exact time it is the keyframes' own error, as far as keyframes close in time show one.
-        arm_stddev_m: (n,) standard deviation of each coordinate of the lever arm, metres.
         time_offset_stddev_s: standard deviation of the clocks' offset that was used.
     """
 
     log: RangeLog
     status: npt.NDArray[np.int8]
-    before: Indices
-    after: Indices
-    fraction: Array
-    centers: Array
-    center_offsets: Array
-    tag_from_center: Array
-    center_stddev: Array
-    arm_stddev_m: Array
     time_offset_stddev_s: float = 0.0
 
     @property
@@ -87,11 +65,6 @@ class RangeObservations:
         """Return the standard deviation (n,) of the antenna's coordinates in a map of this scale, metres."""
         return np.hypot(metres_per_unit * self.center_stddev, self.arm_stddev_m)
 
-    @property
-    def nearest(self) -> Indices:
-        """Index of the nearest keyframe (n,); -1 without a position on the path."""
-        return np.where(self.fraction < 0.5, self.before, self.after)
-
     def predicted_m(self, metric_from_model: Similarity, anchors_m: Array, biases_m: Array) -> Array:
         """Return the (n,) ranges where a similarity places the path, metres; NaN without a position on it.
 
@@ -101,10 +74,6 @@ class RangeObservations:
         index = self.log.anchor_index
         antennas_m = metric_from_model.apply(self.centers) + self.tag_from_center @ metric_from_model.rotation.T
         return np.asarray(np.linalg.norm(antennas_m - anchors_m[index], axis=1) + biases_m[index])
-
-    def on_path(self, rows: Indices) -> OnPath:
-        """Return the positions on the path of these rows, which must have one."""
-        return OnPath(self.before[rows], self.after[rows], self.fraction[rows])
 
     @property
     def placed_rows(self) -> Indices:
@@ -202,4 +171,4 @@ def joined_observations(
         }
         for name, values in moved.items():
             joined.setdefault(name, getattr(part, name).copy())[rows] = values[rows]
-    return RangeObservations(parts[0].log, **joined)
+    return RangeObservations(log=parts[0].log, **joined)

@@ -74,7 +74,7 @@ def small_map(
                 tag_index=np.append(tag_index, 7),
                 shared_stddev_m=np.full(num, np.nan),
             ),
-            on_path=lambda rows: OnPath(points[rows], points[rows] + 1, np.zeros(len(rows))),
+            subset=lambda rows: OnPath(points[rows], points[rows] + 1, np.zeros(len(rows))),
             placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         ),
         site=Site(),

@@ -244,7 +244,16 @@ def _on_given_path(
     status = np.full(len(log), RangeStatus.NO_KEYFRAME_NEAR, dtype=np.int8)
     status[rows] = RangeStatus.USED
     observations = RangeObservations(
-        log, status, one_pose, one_pose, nothing, origin, origin, tags_m, center_stddev=nothing, arm_stddev_m=nothing
+        before=one_pose,
+        after=one_pose,
+        fraction=nothing,
+        centers=origin,
+        center_offsets=origin,
+        tag_from_center=tags_m,
+        center_stddev=nothing,
+        arm_stddev_m=nothing,
+        log=log,
+        status=status,
     )
     still = Trajectory(np.zeros(1, dtype=np.int64), ("",), None, np.zeros((1, 3)), np.eye(3)[None])
     # So few residuals do not show the noise, as place and bias of each anchor follow them.

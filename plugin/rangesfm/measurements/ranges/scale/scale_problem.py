@@ -69,7 +69,7 @@ class ScaleProblem:
     @property
     def on_path(self) -> OnPath:
         """Places of the ranges between keyframes."""
-        return self.observations.on_path(self.rows)
+        return self.observations.subset(self.rows)
 
     @property
     def curve_stddev_m(self) -> Array:
