@@ -16,8 +16,8 @@ from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rang
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import (
     TableForm,
-    UnclearListError,
     times_by_row,
+    unclear_table,
 )
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
 from rangesfm.util.files.contents import AnyPath
@@ -40,22 +40,22 @@ def read_photo_list(
         The rows; their times (n,) in seconds; and the value (n,) of one unit in the last place of each time as written.
 
     Raises:
-        UnclearListError: the columns or the unit are not known for sure; the advice says what to type.
+        UnclearFileError: the columns or the unit are not known for sure; the advice says what to type.
         InputError: a cell is not a time or a name. The error gives the line.
     """
     path = Path(path)
     table = PHOTO_TIMES.read(path, columns)
     if not columns and PHOTO_TIMES.is_canonical(read_head(path)):
         unit = unit or "s"
-    times_s, unit, notes = times_by_row(table, PHOTO_TIMES.what, unit, "--image_times_unit")
+    times_s, unit, notes = times_by_row(table, PHOTO_TIMES.what, unit, "image_times_unit")
     return _with_resolution(replace(table, notes=(*table.notes, *notes)), times_s, unit)
 
 
-def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
+def find_photo_columns(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
     """Return the name of the column of each quantity; None if the table is not one of photo times.
 
     Raises:
-        UnclearListError: it may be one, but the columns are not known for sure.
+        UnclearFileError: it may be one, but the columns are not known for sure.
     """
     photos = [column for column in layout.columns if column.names_photos] or named_photos(layout)
     others = [column for column in layout.columns if column not in photos and column.kind != "nothing"]
@@ -77,8 +77,8 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         return {"image_name": photos[0].name, **guess.columns}
     choices = []
     for one in photos:
-        choices.append(PHOTO_TIMES.choice(f"if {one.name} is the photo", {"image_name": one.name, **guess.columns}))
-    raise UnclearListError(PHOTO_TIMES.what, path, layout, doubts, choices)
+        choices.append(form.choice(f"if {one.name} is the photo", {"image_name": one.name, **guess.columns}))
+    raise unclear_table(form.what, path, layout, doubts, choices)
 
 
 PHOTO_TIMES = TableForm(

@@ -11,7 +11,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape_file import read_markers
 from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.control_points import ControlPoints
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
 from rangesfm.options import PointOptions
 
 
@@ -53,7 +53,7 @@ def test_columns_can_be_named_and_unclear_ones_are_asked_for_by_the_flags_of_poi
     text = "a,b,c,d\nP,1,2,3\nQ,4,5,6\n"
     found = read(tmp_path, text, columns={"marker": "a", "x": "b", "y": "c", "z": "d"})
     assert [p.name for p in found.points] == ["P", "Q"]
-    with pytest.raises(UnclearListError) as error:
+    with pytest.raises(UnclearFileError) as error:
         read(tmp_path, "point,north,east,up,h\nP,1,2,3,4\nQ,4,5,6,5\n")
     assert "a table of points whose columns are not known for sure" in str(error.value)
     assert any("--point_columns marker=point," in choice for choice in map(str, error.value.choices))

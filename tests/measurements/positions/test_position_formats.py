@@ -14,7 +14,7 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_formats import read_positions
 from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
 from rangesfm.measurements.positions.true_positions import read_true_positions
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
 from rangesfm.options import PositionOptions
 
 DAY_S = datetime(2024, 3, 1, tzinfo=timezone.utc).timestamp()
@@ -158,7 +158,7 @@ def test_a_mistake_in_positions_is_named(tmp_path: Path, text: str, options: dic
 
 
 def test_unclear_columns_are_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure") as error:
+    with pytest.raises(UnclearFileError, match="a table of positions whose columns are not known for sure") as error:
         read(tmp_path, "time,a,b,c\n1,2,3,4\n2,3,4,5\n")
     told = [str(choice) for choice in error.value.choices]
     assert told == ["if a, b, c are x, y, z, add --position_columns timestamp=time,x=a,y=b,z=c"]
@@ -283,16 +283,16 @@ def test_local_metres_under_a_heading_for_both_are_no_degrees(tmp_path: Path) ->
 
 
 def test_ranges_without_names_are_not_taken_for_positions(tmp_path: Path) -> None:
-    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure"):
+    with pytest.raises(UnclearFileError, match="a table of positions whose columns are not known for sure"):
         read(tmp_path, "".join(f"{0.5 * k} 2 {5 + k % 3} {4.25 + 0.1 * k}\n" for k in range(20)))
 
 
 def test_photos_with_large_coordinates_are_asked_about_with_whole_commands(tmp_path: Path) -> None:
-    with pytest.raises(UnclearListError) as error:
+    with pytest.raises(UnclearFileError) as error:
         read(tmp_path, "".join(f"{photo} {2e6 + k} {1e6 - k} {400 + k}\n" for k, photo in enumerate(PHOTOS)))
     assert [choice.flags for choice in error.value.choices] == [
-        ("--position_columns", "image_name=1,x=2,y=3,z=4"),
-        ("--position_columns", "image_name=1,x=3,y=2,z=4"),
+        {"position_columns": "image_name=1,x=2,y=3,z=4"},
+        {"position_columns": "image_name=1,x=3,y=2,z=4"},
     ]
 
 

@@ -32,7 +32,7 @@ from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising
 from rangesfm.measurements.ranges.readers.layout import Layout, find_layout
-from rangesfm.util.files.bags import is_bag, messages_of, open_bag, stamp_s, type_name
+from rangesfm.util.files.bags import connections_of, is_bag, messages_of, open_bag, stamp_s, types_in
 from rangesfm.util.files.text_tables import TextTable, header_names, read_head, read_text
 
 CANONICAL_COLUMNS = (
@@ -57,6 +57,7 @@ _FULL_SCALES_RAD_S = np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0])
 _FULL_SCALE_ERROR = 0.03
 _TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _VIDEOS = (".mp4", ".mov", ".360", ".lrv", ".insv")
+_MESSAGES = ("Imu",)  # of sensor_msgs
 _LARGEST_BYTES = 1 << 31  # of a table in an archive
 
 
@@ -115,7 +116,7 @@ def is_imu_log(path: Path) -> bool:
     try:
         if is_bag(path):
             with open_bag(path) as bag:
-                return any(type_name(one.msgtype) == "Imu" for one in bag.connections)
+                return bool(connections_of(bag, _MESSAGES))
         if path.is_dir():
             # A file with both is a log of its own.
             parts = [{*_kinds(file)} for file in path.glob("*.csv")]
@@ -275,10 +276,10 @@ def _signals_of_bag(path: Path) -> list[_Signal]:
     """Return the signals of the only topic of ``sensor_msgs/Imu`` in a bag, or of two with one sensor each."""
     found = list[_Signal]()
     with open_bag(path) as bag:
-        connections = [one for one in bag.connections if type_name(one.msgtype) == "Imu"]
+        connections = connections_of(bag, _MESSAGES)
         if not connections:
-            has = ", ".join(sorted({one.msgtype for one in bag.connections})) or "no messages"
-            raise InputError(f"no log of an inertial sensor in this bag; it has {has}, expected sensor_msgs/Imu", path)
+            has = f"it has {types_in(bag)}, expected sensor_msgs/Imu"
+            raise InputError(f"no log of an inertial sensor in this bag; {has}", path)
         for topic in sorted({one.topic for one in connections}):
             rows = list[tuple[float, ...]]()
             for _, message, received_s in messages_of(bag, [one for one in connections if one.topic == topic]):

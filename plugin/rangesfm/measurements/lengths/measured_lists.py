@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from rangesfm.errors import InputError, printable
@@ -14,37 +15,30 @@ _Found = Mapping[str, Sequence[ColumnSample]]
 """Columns that may hold each quantity."""
 
 
-def _form(
-    what: str,
-    required: Mapping[str, str],
-    optional: Mapping[str, str],
+def _only_columns(
     by_name: Callable[[Layout], _Found | None],
     by_values: Callable[[Layout], _Found | None],
-) -> TableForm:
-    """Make a kind of list.
+    form: TableForm,
+    path: Path,
+    layout: Layout,
+) -> dict[str, str] | None:
+    """Return the name of the column of each quantity, as ``TableForm.find``, where it is the only one that may be it.
 
     Args:
-        what: what it lists, for messages.
-        required, optional: columns of the canonical CSV, by quantity.
         by_name: returns the columns that may hold each quantity by their names, or None if others say that it is no
             such list.
         by_values: the same for a table without names.
     """
-
-    def find(path: Path, layout: Layout) -> dict[str, str] | None:
-        found = (by_name if layout.has_names else by_values)(layout)
-        if found is None:
-            return None
-        for quantity, name in required.items():
-            if (num := len(those := found.get(quantity, []))) != 1:
-                which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
-                listed = printable(", ".join(layout.names))
-                message = f"a table of {what} in which {which} {name}; found {listed}"
-                raise InputError(f"{message}; {form.expected}", path)
-        return {quantity: those[0].name for quantity, those in found.items() if len(those) == 1}
-
-    form = TableForm(what, {**required, **optional}, tuple(required), find)
-    return form
+    found = (by_name if layout.has_names else by_values)(layout)
+    if found is None:
+        return None
+    for quantity in form.required:
+        if (num := len(those := found.get(quantity, []))) != 1:
+            which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
+            listed = printable(", ".join(layout.names))
+            message = f"a table of {form.what} in which {which} {form.names[quantity]}; found {listed}"
+            raise InputError(f"{message}; {form.expected}", path)
+    return {quantity: those[0].name for quantity, those in found.items() if len(those) == 1}
 
 
 def _ends(columns: Sequence[ColumnSample]) -> tuple[list[ColumnSample], list[ColumnSample]]:
@@ -116,25 +110,26 @@ def _marks_by_value(layout: Layout) -> _Found | None:
     return {"marker": others, "image_name": photos, **dict(zip(("x", "y"), pixels))} if len(numbers) == 2 else None
 
 
-_ENDS = {"from": "from", "to": "to"}
-LENGTHS = _form(
+LENGTHS = TableForm(
     "taped distances",
-    {**_ENDS, "distance": "distance_m"},
-    {"stddev": "stddev_m", "kind": "kind"},
-    _lengths_by_name,
-    _lengths_by_value,
+    {"from": "from", "to": "to", "distance": "distance_m", "stddev": "stddev_m", "kind": "kind"},
+    ("from", "to", "distance"),
+    partial(_only_columns, _lengths_by_name, _lengths_by_value),
 )
-PAIRS = _form(
+_ENDS = ("from", "to")
+PAIRS = TableForm(
     "pairs of points",
+    dict(zip(_ENDS, _ENDS)),
     _ENDS,
-    {},
-    lambda layout: dict(zip(_ENDS, _ends(layout.columns))),
-    lambda layout: dict(zip(_ENDS, ([column] for column in layout.columns))),
+    partial(
+        _only_columns,
+        lambda layout: dict(zip(_ENDS, _ends(layout.columns))),
+        lambda layout: dict(zip(_ENDS, ([column] for column in layout.columns))),
+    ),
 )
-MARKS = _form(
+MARKS = TableForm(
     "marks in photos",
     {"marker": "marker", "image_name": "image_name", "x": "x_px", "y": "y_px"},
-    {},
-    _marks_by_name,
-    _marks_by_value,
+    ("marker", "image_name", "x", "y"),
+    partial(_only_columns, _marks_by_name, _marks_by_value),
 )

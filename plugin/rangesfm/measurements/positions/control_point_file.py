@@ -14,7 +14,7 @@ from rangesfm.measurements.positions.control_points import ControlPoint, Control
 from rangesfm.measurements.positions.position_log import crs_in_head, crs_in_text, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.anchor_file import find_or_ask
 from rangesfm.measurements.ranges.readers.layout import Layout
-from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, UnclearListError, metres
+from rangesfm.measurements.ranges.readers.lists import AXES, TableForm, metres
 from rangesfm.measurements.ranges.readers.vocabulary import KIND
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
 from rangesfm.util.files.text_tables import TextTable, is_number, read_head, read_without_header, repeated
@@ -32,7 +32,7 @@ def read_control_points(options: PointOptions) -> ControlPoints:
         options: which name the file; none: there are no points.
 
     Raises:
-        UnclearListError: the columns are not known for sure; the advice says what to type.
+        UnclearFileError: the columns are not known for sure; the advice says what to type.
         InputError: a file is not valid; the error gives the line.
     """
     path = options.path
@@ -59,18 +59,13 @@ def is_point_file(head: str) -> bool:
     return POINTS.has_usual_names(head) or is_gcp_list(head)
 
 
-def _find_columns(path: Path, layout: Layout) -> dict[str, str] | None:
+def _find_columns(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
     """Return the name of the column of each quantity: as in the canonical CSV, else recognized as in one of anchors."""
-    if {POINTS.names[quantity] for quantity in POINTS.required} <= {*layout.names}:
-        return {quantity: name for quantity, name in POINTS.names.items() if name in layout.names}
-    try:
-        found = find_or_ask(path, layout)
-    except UnclearListError as error:
-        raise error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"}) from None
-    if found is None:
+    if {form.names[quantity] for quantity in form.required} <= {*layout.names}:
+        return {quantity: name for quantity, name in form.names.items() if name in layout.names}
+    columns = find_or_ask(form, path, layout)
+    if columns is None:
         return None
-    own = {"anchor_id": "marker", "position_stddev": "stddev"}
-    columns = {own.get(quantity, quantity): name for quantity, name in found.items() if "bias" not in quantity}
     kinds = [
         column.name
         for column in layout.columns
@@ -85,6 +80,7 @@ POINTS = TableForm(
     ("marker", *AXES),
     _find_columns,
     "point_columns",
+    own={"anchor_id": "marker", "position_stddev": "stddev"},
 )
 
 

@@ -19,11 +19,11 @@ from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_risi
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, are_quaternions
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
-    Choice,
     TableForm,
-    UnclearListError,
     coordinates_of_point,
+    unclear_table,
 )
+from rangesfm.measurements.ranges.readers.unclear import Choice
 
 STDDEVS = tuple(f"stddev_{axis}" for axis in AXES)
 COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
@@ -31,11 +31,11 @@ _KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
 
 
-def find_position_columns(path: Path, layout: Layout) -> dict[str, str]:
+def find_position_columns(form: TableForm, path: Path, layout: Layout) -> dict[str, str]:
     """Return the name of the column of each quantity.
 
     Raises:
-        UnclearListError: it may be several; the advice has a command for each.
+        UnclearFileError: it may be several; the advice has a command for each.
     """
     guess = Guess()
     photos = [column for column in layout.columns if column.names_photos][:1] or named_photos(layout)[:1]
@@ -53,7 +53,7 @@ def find_position_columns(path: Path, layout: Layout) -> dict[str, str]:
         guess.doubts.insert(0, "no column seems to be the time or the photo")
     _add_errors(free, guess.columns)
     if guess.doubts:
-        raise UnclearListError(POSITIONS.what, path, layout, guess.doubts, [*_choices(free, guess.columns, axes)])
+        raise unclear_table(form.what, path, layout, guess.doubts, [*_choices(form, free, guess.columns, axes)])
     return guess.columns
 
 
@@ -168,7 +168,7 @@ def _add_errors(free: Sequence[ColumnSample], columns: dict[str, str]) -> None:
 
 
 def _choices(
-    free: Sequence[ColumnSample], columns: Mapping[str, str], axes: Mapping[str, dict[str, str]]
+    form: TableForm, free: Sequence[ColumnSample], columns: Mapping[str, str], axes: Mapping[str, dict[str, str]]
 ) -> Iterator[Choice]:
     """Yield the ways to read the table, each with a whole command; one with NAME where values tell nothing."""
     has_key, has_axes = bool(_KEYS & columns.keys()), columns.keys() >= {*AXES}
@@ -178,10 +178,10 @@ def _choices(
     for (is_key, key), (are_axes, place) in islice(ways, _MAX_NUM_WAYS):
         taken = {**columns, **key, **place}
         if len({*taken.values()}) == len(taken):
-            yield POSITIONS.choice(f"if {' and '.join(filter(None, (is_key, are_axes)))}", taken)
+            yield form.choice(f"if {' and '.join(filter(None, (is_key, are_axes)))}", taken)
     if not ways:
         unknown = {key: "NAME" for key in (*(() if has_key else ("timestamp",)), *AXES) if key not in columns}
-        yield POSITIONS.choice("with the names of the columns", {**columns, **unknown})
+        yield form.choice("with the names of the columns", {**columns, **unknown})
 
 
 def _possible_keys(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str, str]]]:

@@ -58,7 +58,7 @@ def read_positions(options: PositionOptions) -> PositionLog | None:
     """Read the positions that a survey names; None if it names none.
 
     Raises:
-        UnclearListError: the columns are not known for sure; the advice says what to type.
+        UnclearFileError: the columns are not known for sure; the advice says what to type.
         InputError: the file is not valid; the error gives the line.
     """
     path = options.path
@@ -94,7 +94,7 @@ def _log_of_table(
     table = replace(table, missing=MISSING)
     notes, crs = [*table.notes], crs_in_head(read_head(table.path))
     if "timestamp" in table:
-        times_s, _, more = times_by_row(table, POSITIONS.what, time_unit, "--position_time_unit")
+        times_s, _, more = times_by_row(table, POSITIONS.what, time_unit, "position_time_unit")
         moments: Moments = ByTime(times_s)
         notes += more
     else:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_formats import read_positions
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
 from rangesfm.options import PositionOptions
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import read_head
@@ -26,7 +26,7 @@ def read_true_positions(path: AnyPath) -> Reference:
         return read_reference(path)
     try:
         log = read_positions(PositionOptions().changed(path=path))
-    except UnclearListError as error:
+    except UnclearFileError as error:
         raise InputError(f"{'; '.join(error.about)}; {_EXPECTED}", path) from None
     assert log is not None
     if log.crs:

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rangesfm.errors import InputError
@@ -18,16 +19,16 @@ from rangesfm.measurements.imu.formats import is_imu_log
 from rangesfm.measurements.imu.signals import kind_of_file
 from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
 from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
+from rangesfm.measurements.positions import position_columns
 from rangesfm.measurements.positions.control_point_file import is_point_file
-from rangesfm.measurements.positions.position_columns import find_position_columns, is_degrees
 from rangesfm.measurements.positions.position_formats import is_of_positions
 from rangesfm.measurements.ranges.anchors import anchor_file
 from rangesfm.measurements.ranges.errors.error_curve import is_error_curve_file
 from rangesfm.measurements.ranges.readers import find_log_reader, read_ranges
 from rangesfm.measurements.ranges.readers.guess import guess_columns
 from rangesfm.measurements.ranges.readers.layout import Layout, find_layout
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
 from rangesfm.measurements.ranges.readers.table import TABLE
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
 from rangesfm.measurements.ranges.readers.vocabulary import ABOUT_ANCHORS, words_of
 from rangesfm.sfm import photo_list
 from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS
@@ -77,9 +78,10 @@ _TABLES: dict[str, Callable[[str], bool]] = {
 }
 # Lists in tables of any layout: how their columns are found, and how they are read.
 _LISTS: dict[str, tuple[Callable[[Path, Layout], object], Callable[[Path], object]]] = {
-    ANCHORS: (anchor_file.find_anchor_columns, anchor_file.read_anchor_list),
-    TIMES: (photo_list.find_photo_columns, photo_list.read_photo_list),
+    ANCHORS: (partial(anchor_file.find_points, anchor_file.ANCHORS), anchor_file.read_anchor_list),
+    TIMES: (photo_list.PHOTO_TIMES.find_columns, photo_list.read_photo_list),
 }
+_KEY_OF_LIST = {"anchors": ANCHORS, "positions": POSITIONS, "photo times": TIMES}
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Found:
     paths: dict[str, list[Path]]
     calibrations: dict[Path, tuple[CameraCalibration, ...]]
     models: tuple[Path, ...]
-    unclear: dict[str, list[UnclearListError]]
+    unclear: dict[str, list[UnclearFileError]]
     notes: tuple[str, ...]
     like_anchors: dict[Path, str] = field(default_factory=dict)
 
@@ -114,7 +116,7 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[CameraCalibration, ...]] = {}
     models: list[Path] = []
-    unclear: dict[str, list[UnclearListError]] = defaultdict(list)
+    unclear: dict[str, list[UnclearFileError]] = defaultdict(list)
     unused: dict[str, list[Path]] = defaultdict(list)
     notes: list[str] = []
     unsure: dict[Path, InputError] = {}
@@ -139,17 +141,19 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
                     (models if key == MODEL else paths[key]).append(path)
                 elif not has_photos:
                     unused[_UNKNOWN].append(path)
-        except UnclearListError as error:
-            unclear[{anchor_file.WHAT: ANCHORS, "positions": POSITIONS}.get(error.what, TIMES)].append(error)
         except InputError as error:
-            if error.advice:
+            if isinstance(error, UnclearFileError) and error.what in _KEY_OF_LIST:
+                unclear[_KEY_OF_LIST[error.what]].append(error)
+            elif error.advice:
                 unsure[path] = error
             else:
                 notes.append(str(error))
     like_anchors = {}
     if LOG in paths and ANCHORS not in {*paths, *unclear}:
         tables = [path for path in (*unsure, *unused[_UNKNOWN]) if path.suffix.lower() in _TABLE_EXTENSIONS]
-        if those := [asked for path in tables if (asked := anchor_file.like_anchors(path)) is not None]:
+        if those := [
+            asked for path in tables if (asked := anchor_file.like_points(anchor_file.ANCHORS, path)) is not None
+        ]:
             unclear[ANCHORS] = those
         like_anchors = {path: why for why, those in unused.items() for path in those if is_about_anchors(path)}
     if LOG not in paths:
@@ -197,7 +201,7 @@ def _key_of(path: Path) -> str | None:
     """Return the dotted key of a survey file that takes such a file, or None if it is not recognised.
 
     Raises:
-        UnclearListError: it may be a list of anchors or of photo times, but is not understood.
+        UnclearFileError: it may be a list of anchors or of photo times, but is not understood.
         InputError: it may be a log, but is not understood.
     """
     if is_bag(path):
@@ -228,14 +232,14 @@ def _key_of(path: Path) -> str | None:
             return LOG
         # A short table without names is asked about.
         is_short = not layout.has_names and len(layout.columns[0].cells) <= _MOST_POINTS
-        with nullcontext() if is_short else suppress(UnclearListError):
+        with nullcontext() if is_short else suppress(UnclearFileError):
             return (_list_of(path) if is_short or layout.has_names else None) or LOG
         return LOG
     if is_imu_log(path):
         return IMU
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
         return _measured_or_true(path) if key == REFERENCE else key
-    with nullcontext() if is_table else suppress(UnclearListError):
+    with nullcontext() if is_table else suppress(UnclearFileError):
         if key := _list_of(path) or _positions_of(path):
             return key
     if unsure.advice and is_table:
@@ -254,21 +258,23 @@ def _positions_of(path: Path) -> str | None:
     """Return the key for a table of the camera's positions by photo or time; None if it is none.
 
     Raises:
-        UnclearListError: it holds places on the Earth, or of photos, and the columns are not known for sure.
+        UnclearFileError: it holds places on the Earth, or of photos, and the columns are not known for sure.
     """
     layout = find_layout(path)
     if layout is None or not layout.has_names:
         return None
-    on_earth = all(any(is_degrees(column.name, axis) for column in layout.columns) for axis in ("x", "y"))
+    on_earth = all(
+        any(position_columns.is_degrees(column.name, axis) for column in layout.columns) for axis in ("x", "y")
+    )
     try:
-        columns = find_position_columns(path, layout)
-    except UnclearListError:
+        columns = position_columns.find_position_columns(position_columns.POSITIONS, path, layout)
+    except UnclearFileError:
         if on_earth:
             raise
         return None
     guess = guess_columns(layout)
-    ranges = {} if guess is None else {key: name for key, name in guess.told.items() if key.startswith("range")}
-    if not {*ranges.values()} <= {*columns.values()}:
+    ranges = {name for quantity, name in guess.columns.items() if quantity.startswith("range")}
+    if not ranges <= {*columns.values()}:
         return None  # perhaps a log that has ranges beside the positions
     return POSITIONS if on_earth else _measured_or_true(path)
 
@@ -277,7 +283,7 @@ def _list_of(path: Path) -> str | None:
     """Return the dotted key for a list in a table of any layout, or None if the file is none.
 
     Raises:
-        UnclearListError: the columns or a unit are not known for sure.
+        UnclearFileError: the columns or a unit are not known for sure.
     """
     layout = find_layout(path)
     if layout is None:
@@ -286,7 +292,7 @@ def _list_of(path: Path) -> str | None:
         if find(path, layout) is not None:
             try:
                 read(path)
-            except UnclearListError:
+            except UnclearFileError:
                 raise
             except InputError:  # an error in a cell; rangesfm check reports it
                 pass

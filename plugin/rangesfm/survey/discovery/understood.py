@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,10 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape_file import read_markers
+from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.readers import read_ranges
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
+from rangesfm.options import PointOptions
 from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.photo_files import gps_data, usable_photos
 from rangesfm.survey.discovery.found_files import (
@@ -81,7 +82,7 @@ def understand(
     if questions:
         several = "more than one survey could be meant"
         first = next((those[0] for those in unclear.values()), None)
-        raise first.asking(questions) if first else InputError(several, folders[0], advice=questions)
+        raise first.advising(questions) if first else InputError(several, folders[0], advice=questions)
     if ANCHORS not in values:
         for path, why in found.like_anchors.items():
             raise InputError(
@@ -165,8 +166,10 @@ def _tell_points_from_anchors(found: Found, values: Mapping[str, Any]) -> None:
         if has_log or is_about_anchors(Path(error.path or "")):
             found.unclear.setdefault(ANCHORS, []).append(error)
         else:
-            as_points = error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"})
-            found.unclear.setdefault(POINTS, []).append(as_points)
+            try:
+                read_control_points(PointOptions(path=error.path))
+            except UnclearFileError as as_points:
+                found.unclear.setdefault(POINTS, []).append(as_points)
 
 
 def _names_of_marks(path: Path) -> Iterator[str]:
@@ -175,7 +178,7 @@ def _names_of_marks(path: Path) -> Iterator[str]:
 
 
 def _questions(
-    key: str, unclear: Sequence[UnclearListError], folders: Sequence[Path], command: Sequence[str]
+    key: str, unclear: Sequence[UnclearFileError], folders: Sequence[Path], command: Sequence[str]
 ) -> Iterator[str]:
     """Yield lines that ask how lists are to be read, with the command for each way."""
     flag = next(item.flag for item in KEYS if item.dotted == key)
@@ -183,7 +186,7 @@ def _questions(
         path = Path(error.path or "")
         yield from (f"{short_path(path, folders)}: {line}" for line in error.about)
         for choice in error.choices:
-            yield f"{choice.when}: {shlex.join([*command, f'--{flag}', _typed(path), *choice.flags])}"
+            yield choice.typed([*command, f"--{flag}", _typed(path)], {})
     what = unclear[0].what
     yield f"if no such file holds {what}: move it out of the folder, or name the file of {what} by --{flag} PATH"
 

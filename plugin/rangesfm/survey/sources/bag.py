@@ -21,7 +21,7 @@ from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions
 from rangesfm.survey.sources.source import MAX_SIDE_PX, Frame, PhotoSource
-from rangesfm.util.files.bags import messages_of, open_bag, stamp_s, type_name
+from rangesfm.util.files.bags import connections_of, messages_of, open_bag, stamp_s, type_name
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -69,7 +69,7 @@ def open_images(path: Path, topic: str) -> PhotoSource:
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:
     """Return the number of images of each image topic."""
-    images = {item.topic for item in bag.connections if type_name(item.msgtype) in (_RAW, _COMPRESSED)}
+    images = {item.topic for item in connections_of(bag, (_RAW, _COMPRESSED))}
     return {topic: bag.topics[topic].msgcount for topic in sorted(images)}
 
 
@@ -111,7 +111,7 @@ def _camera(
     Nothing of it is given where there is no CameraInfo, or where it does not fit the images.
     """
     not_given = CameraOptions()
-    infos = [item.topic for item in bag.connections if type_name(item.msgtype) == _CAMERA]
+    infos = [item.topic for item in connections_of(bag, (_CAMERA,))]
     beside = [topic.rpartition("/")[0]]
     beside += [beside[0].rpartition("/")[0]] if kind == _COMPRESSED else []  # for /camera/image_raw/compressed
     info_topic = next((info for place in beside for info in infos if info.rpartition("/")[0] == place), None)

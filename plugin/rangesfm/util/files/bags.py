@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,19 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
     except Exception as error:  # a broken bag makes the parsers raise errors of all kinds
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"cannot be read as a ROS bag ({text})", path) from error
+
+
+def connections_of(bag: AnyReader, types: Collection[str]) -> list[Connection]:
+    """Return the connections of a bag with messages of some types, which are named without their packages.
+
+    Any package may define such a type.
+    """
+    return [connection for connection in bag.connections if type_name(connection.msgtype) in types]
+
+
+def types_in(bag: AnyReader) -> str:
+    """Return the types of all messages in a bag, for messages to the user."""
+    return ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
 
 
 def messages_of(bag: AnyReader, connections: Sequence[Connection]) -> Iterator[tuple[str, Any, float]]:

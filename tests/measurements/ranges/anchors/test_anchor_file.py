@@ -14,14 +14,15 @@ from tests.known import known
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.measurements.ranges.anchors.anchor_file import (
+    ANCHORS,
     _named_quantity,
-    find_anchor_columns,
+    find_points,
     read_anchor_list,
     read_anchors,
     write_anchors,
 )
 from rangesfm.measurements.ranges.readers.layout import find_layout
-from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError, flags_typed
 
 HEADER = "anchor_id,x_m,y_m,z_m"
 FULL_HEADER = HEADER + ",position_stddev_m,range_bias_m,range_bias_stddev_m"
@@ -138,14 +139,14 @@ def table(folder: Path, text: str, name: str = "points.csv") -> Path:
 
 
 def columns_of(path: Path) -> dict[str, str] | None:
-    return find_anchor_columns(path, known(find_layout(path)))
+    return find_points(ANCHORS, path, known(find_layout(path)))
 
 
 def doubts_about(path: Path) -> tuple[str, dict[str, str]]:
     """Return what is not sure, and the flags of each choice by the case in which it is right."""
-    with pytest.raises(UnclearListError) as caught:
+    with pytest.raises(UnclearFileError) as caught:
         columns_of(path)
-    return caught.value.about[1], {choice.when: " ".join(choice.flags) for choice in caught.value.choices}
+    return caught.value.about[1], {choice.when: " ".join(flags_typed(choice.flags)) for choice in caught.value.choices}
 
 
 ROWS = "/A,1.5,2.5,3.5/B,4.5,5.5,6.5"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 
@@ -15,21 +16,20 @@ from rangesfm.measurements.ranges.readers.guess import MAX_NUM_IDS, by_id_rather
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
-    Choice,
     TableForm,
-    UnclearListError,
     coordinates_of_point,
     metres,
-    ways_to_complete,
+    unclear_table,
 )
+from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
 from rangesfm.measurements.ranges.readers.units import named_length_unit
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable, repeated, write_user_table
 
-WHAT = "anchors"
 QUANTITIES = ("anchor_id", "x", "y", "z", "position_stddev", "range_bias", "range_bias_stddev")
 _GEOGRAPHIC = "EPSG:4979"
+_MAX_NUM_WAYS = 6  # ways to read a list that are offered
 # Coordinates beyond this, metres, are not local but those of a surveyed grid.
 LOCAL_M = 500.0
 
@@ -60,7 +60,7 @@ def read_anchor_list(
         The anchors in the order of the file, and lines for the user about how the file was read.
 
     Raises:
-        UnclearListError: the columns are not known for sure; the advice says what to type.
+        UnclearFileError: the columns are not known for sure; the advice says what to type.
         InputError: an anchor appears twice, a position is incomplete, or a cell is not a number. The error gives the
             line.
     """
@@ -82,11 +82,14 @@ def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
     write_user_table(Path(path), [*ANCHORS.names.values()], rows)
 
 
-def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
-    """Return the name of the column of each quantity; None if the table is not one of anchors.
+def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
+    """Return the name of the column of each of QUANTITIES; None if the table is not one of points.
+
+    Args:
+        form: the kind of points, such as ANCHORS.
 
     Raises:
-        UnclearListError: it may be one, but the columns are not known for sure.
+        UnclearFileError: it may be one, but the columns are not known for sure.
     """
     found = _by_name(layout) if layout.has_names else _by_values(layout)
     ids, axes = found["anchor_id"], {axis: found[axis] for axis in AXES}
@@ -107,36 +110,36 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         several = found[quantity]
         if len(several) > 1:
             doubts.append(f"any of {_listed(several)} may be {what}")
-            choices += [ANCHORS.choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
+            choices += [form.choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
         elif not several and not degrees:
             doubts.append(f"no column seems to be {what}")
     if not doubts and degrees:
         named = columns | degrees
         doubts.append(f"{degrees['y']} and {degrees['x']} are degrees, of no known coordinate system")
-        choices = [ANCHORS.choice("if that is WGS 84", named, "--anchor_crs", _GEOGRAPHIC)] if "z" in named else []
+        choices = [form.choice("if that is WGS 84", named, crs=_GEOGRAPHIC)] if "z" in named else []
     elif not doubts:
-        for doubt, those in _doubts_about_axes(layout, columns):
+        for doubt, those in _doubts_about_axes(form, layout, columns):
             doubts.append(doubt)
             choices += those
     if not doubts:
         return columns
     if not choices and not degrees:
-        choices = [ANCHORS.choice(when, ways) for when, ways in ways_to_complete(columns, _candidates(layout, columns))]
+        choices = [*_ways_to_complete(form, layout, columns)]
     unknown = {quantity: "NAME" for quantity in ("anchor_id", *AXES) if quantity not in columns | degrees}
-    choices = choices or [ANCHORS.choice("with the names of the columns", columns | degrees | unknown)]
-    raise UnclearListError(WHAT, path, layout, doubts, choices)
+    choices = choices or [form.choice("with the names of the columns", columns | degrees | unknown)]
+    raise unclear_table(form.what, path, layout, doubts, choices)
 
 
-def find_or_ask(path: Path, layout: Layout) -> dict[str, str] | None:
+def find_or_ask(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
     """Do the same, and ask about a short table that is like a list of points as well."""
-    columns = find_anchor_columns(path, layout)
-    if columns is None and (unclear := like_anchors(path)) is not None:
+    columns = find_points(form, path, layout)
+    if columns is None and (unclear := like_points(form, path)) is not None:
         raise unclear
     return columns
 
 
 ANCHORS = TableForm(
-    WHAT,
+    "anchors",
     {quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES},
     ("anchor_id", *AXES),
     find_or_ask,
@@ -145,7 +148,7 @@ ANCHORS = TableForm(
 )
 
 
-def like_anchors(path: Path) -> UnclearListError | None:
+def like_points(form: TableForm, path: Path) -> UnclearFileError | None:
     """Return the question for a short table that is like a list of points, but whose names are not known; else None."""
     layout = find_layout(path)
     if layout is None or not layout.has_names or len(layout.columns[0].cells) > MAX_NUM_IDS:
@@ -157,18 +160,22 @@ def like_anchors(path: Path) -> UnclearListError | None:
         return None
     ways = [dict(zip(AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
     choices = [
-        ANCHORS.choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
+        form.choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
         for way in ways
     ]
-    return UnclearListError(WHAT, path, layout, ["the names of the columns are not known"], choices)
+    return unclear_table(form.what, path, layout, ["the names of the columns are not known"], choices)
 
 
-def _candidates(layout: Layout, columns: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the columns that may hold each quantity that has none yet, by their values."""
+def _ways_to_complete(form: TableForm, layout: Layout, columns: Mapping[str, str]) -> Iterator[Choice]:
+    """Yield the ways to give each quantity that has no column yet one that may hold it, by its values."""
     free = [column for column in layout.columns if column.name not in columns.values()]
     may_be = {quantity: [one.name for one in free if one.kind == "numbers"] for quantity in AXES}
     may_be["anchor_id"] = [one.name for one in free if one.num_distinct == len(one.cells) and _may_be_id(one)]
-    return {quantity: may_be[quantity] for quantity in ("anchor_id", *AXES) if quantity not in columns}
+    missing = [quantity for quantity in ("anchor_id", *AXES) if quantity not in columns]
+    ways = [way for way in product(*(may_be[quantity] for quantity in missing)) if len({*way}) == len(way)]
+    for way in ways if missing and len(ways) <= _MAX_NUM_WAYS else ():
+        when = " and ".join(f"{name} is {quantity}" for quantity, name in zip(missing, way))
+        yield form.choice(f"if {when}", {**columns, **dict(zip(missing, way))})
 
 
 def _may_be_id(column: ColumnSample) -> bool:
@@ -246,7 +253,9 @@ def _is_of_times(layout: Layout, ids: Sequence[ColumnSample]) -> bool:
     return has_times and (is_of_ranges or not ids or ids[0].num_distinct < len(ids[0].cells))
 
 
-def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[tuple[str, list[Choice]]]:
+def _doubts_about_axes(
+    form: TableForm, layout: Layout, columns: Mapping[str, str]
+) -> Iterator[tuple[str, list[Choice]]]:
     """Yield what is not sure about the axes, with the choices there are: their order, and their units."""
     by_name = {column.name: column for column in layout.columns}
     order = [column.name for column in layout.columns]
@@ -256,19 +265,19 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
         if largest > LOCAL_M or len(order) > 4:
-            first = ANCHORS.choice("if the numbers are x, y, z or east, north, height", columns)
-            second = ANCHORS.choice("if they are north, east, height (PNEZD)", swapped)
+            first = form.choice("if the numbers are x, y, z or east, north, height", columns)
+            second = form.choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]
     elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
         choices = [
-            ANCHORS.choice(f"if {x} is north", swapped),
-            ANCHORS.choice(f"if {x} is east and {y} is north", columns),
+            form.choice(f"if {x} is north", swapped),
+            form.choice(f"if {x} is east and {y} is north", columns),
         ]
         yield f"{y} comes before {x}, as where surveyors call north x", choices
     units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
     if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})
-        choices = [ANCHORS.choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
+        choices = [form.choice(f"if all are in {unit}", columns, unit=unit) for unit in told]
         yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices
 
 

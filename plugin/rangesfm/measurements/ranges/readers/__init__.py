@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import ros, trek
 from rangesfm.measurements.ranges.readers.measured import without_held
 from rangesfm.measurements.ranges.readers.printed import PRINTED
-from rangesfm.measurements.ranges.readers.reader import Reader, ReadOptions, tell_roles
+from rangesfm.measurements.ranges.readers.reader import Reader, tell_roles
 from rangesfm.measurements.ranges.readers.table import (
     CANONICAL_CSV,
     MAPPED,
@@ -27,6 +28,7 @@ from rangesfm.measurements.ranges.readers.table import (
     table_reader,
     write_ranges_csv,
 )
+from rangesfm.measurements.ranges.readers.unclear import UnclearFileError, columns_typed
 from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, RangesOptions
 from rangesfm.util.files.bags import is_bag_folder
 from rangesfm.util.files.contents import AnyPath
@@ -37,7 +39,6 @@ from rangesfm.util.geometry.moments import ByPhoto
 __all__ = ["files_of_log", "find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
 _READERS = (ros.READER, CANONICAL_CSV, *PRESETS, MAPPED, TABLE, *PRINTED, trek.READER)
-_NOTHING_SAID = ReadOptions()
 
 
 def reader_names() -> tuple[str, ...]:
@@ -73,11 +74,10 @@ def read_ranges(
         InputError: the file is missing, empty or damaged, is not understood for sure (the advice says what to type), or
             has no usable range. The error gives the line if there is one.
     """
-    paths = _paths(path)
-    table = {name: getattr(options, name) for name in RangesOptions.model_fields}
-    reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
-    chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else ""))
-    logs = [reader.read(file, reading) for file, reader in chosen]
+    paths, options = _paths(path), options.changed(**said)
+    with _asking_by_commands(paths, options):
+        chosen = _choose_readers(paths, options, options.format or ("mapped" if options.columns else ""))
+        logs = [reader.read(file, options) for file, reader in chosen]
     for one in logs:
         _check_numbers(one)
     source = paths[0] if len(paths) == 1 else paths[0].parent
@@ -101,12 +101,30 @@ def read_anchors_in_log(path: AnyPath | Sequence[AnyPath], *, format: str = "") 
     Raises:
         InputError: the file is missing, empty, or of no known format.
     """
-    chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
+    paths, options = _paths(path), RangesOptions()
+    with _asking_by_commands(paths, options):
+        chosen = _choose_readers(paths, options, format)
     anchors = [(file, anchor) for file, reader in chosen for anchor in reader.read_anchors(file)]
     for file, anchor in anchors:
         if anchor.position_m is not None and not COORDINATE_M.hold(anchor.position_m).all():
             raise InputError(f"the position of anchor {anchor.anchor_id} is not one, expected {COORDINATE_M}", file)
     return tuple(anchor for _, anchor in anchors)
+
+
+@contextmanager
+def _asking_by_commands(paths: Sequence[Path], options: RangesOptions) -> Iterator[None]:
+    """Let the error about an unclear log of the block advise whole commands, with what the user has said already."""
+    try:
+        yield
+    except UnclearFileError as error:
+        said = {
+            "columns": columns_typed(options.columns),
+            "timestamp_unit": options.timestamp_unit,
+            "range_unit": options.range_unit,
+            "separator": options.separator,
+        }
+        command = ["rangesfm", "ranges", *map(str, paths)]
+        raise error.advising([*error.about, *(choice.typed(command, said) for choice in error.choices)]) from None
 
 
 def _check_numbers(log: RangeLog) -> None:
@@ -131,7 +149,7 @@ def _paths(path: AnyPath | Sequence[AnyPath]) -> list[Path]:
     return [*map(Path, paths)]
 
 
-def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str) -> list[tuple[Path, Reader]]:
+def _choose_readers(paths: Sequence[Path], options: RangesOptions, format: str) -> list[tuple[Path, Reader]]:
     """Return every file of the log with its reader; other files in a folder are left out."""
     files = [file for path in paths for file in files_of_log(path)]
     is_folder = len(paths) == 1 and len(files) > 1 and paths[0].is_dir()
@@ -199,7 +217,7 @@ def files_of_log(path: Path) -> list[Path]:
     return sorted(found, key=lambda file: natural_order(file.name))
 
 
-def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str = "") -> Reader:
+def find_log_reader(path: Path, options: RangesOptions = RangesOptions(), format: str = "") -> Reader:
     """Find the reader of a file.
 
     Args:

@@ -16,7 +16,6 @@ from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.measurements.ranges.readers.counters import continued
 from rangesfm.measurements.ranges.readers.layout import MISSING
 from rangesfm.measurements.ranges.readers.measured import which_are_measured, which_are_within_reach
-from rangesfm.measurements.ranges.readers.reader import ReadOptions
 from rangesfm.measurements.ranges.readers.times import (
     CIVIL_TIME,
     CIVIL_UNITS,
@@ -26,6 +25,7 @@ from rangesfm.measurements.ranges.readers.times import (
     Clock,
     date_order,
 )
+from rangesfm.measurements.ranges.readers.unclear import Choice, columns_typed
 from rangesfm.measurements.ranges.readers.units import (
     SLOWEST_S,
     UNITS_PER_METRE,
@@ -34,9 +34,10 @@ from rangesfm.measurements.ranges.readers.units import (
     range_unit,
     time_unit,
     units_within_reach,
+    which_unit,
 )
 from rangesfm.measurements.ranges.twr import StampOptions, double_sided_range, single_sided_range
-from rangesfm.options import TIME_S
+from rangesfm.options import TIME_S, RangesOptions
 from rangesfm.util.files.text_tables import TextTable
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -50,7 +51,7 @@ NO_WIDE: Final[Mapping[str, tuple[str, str]]] = MappingProxyType({})
 
 def read_columns(
     table: TextTable,
-    options: ReadOptions,
+    options: RangesOptions,
     format: str,
     *,
     wide: Mapping[str, tuple[str, str]] = NO_WIDE,
@@ -76,7 +77,7 @@ def read_columns(
     anchor, tag = _anchors(table, wide, anchor_id, is_literal), _tags(table, wide, is_literal)
     timestamps, image_name = np.zeros(0), list[str]()
     if "timestamp" in table:
-        ask = partial(options.which_unit, path, "timestamp")
+        ask = partial(which_unit, path, "timestamp")
         # One anchor after the other in a file: the times go back to the log's beginning, whatever the clock is.
         in_turn = wide or np.count_nonzero(np.diff(anchor.index)) >= len(anchor.names)
         may_wrap = bool(in_turn or len(anchor.names) < 2)
@@ -88,14 +89,14 @@ def read_columns(
     link = anchor.index * len(tag.names) + tag.index
     measured, of_codes = which_are_measured(ranges, link, path)
     notes += of_codes
-    unit, others = "m", list[str]()
+    unit, others = "m", list[Choice]()
     if "range" in table or wide:
         column = table.heading("range" if "range" in table else next(iter(wide)))
-        ask = partial(options.which_unit, path, "range")
+        ask = partial(which_unit, path, "range")
         times = timestamps[row[measured]] if "timestamp" in table else timestamps
         unit = options.range_unit or range_unit(column, ranges[measured], times, link[measured], notes, ask)
-        mapped = options if options.columns or not is_literal else options.changed(columns=table.names)
-        others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges[measured], unit)]
+        mapped = {"columns": columns_typed(table.names)} if is_literal and not options.columns else {}
+        others = [Choice("", {**mapped, "range_unit": other}) for other in units_within_reach(ranges[measured], unit)]
     per_metre = UNITS_PER_METRE[unit]
     ranges_m = ranges / per_metre
     measured[measured], of_far = which_are_within_reach(ranges_m[measured], path, others)
@@ -167,7 +168,7 @@ def _ids(table: TextTable, column: str, is_literal: bool, empty: str | None = No
     return Categories(merged.names, merged.index[ids.index])
 
 
-def _ranges(table: TextTable, columns: Sequence[str], options: ReadOptions) -> Array:
+def _ranges(table: TextTable, columns: Sequence[str], options: RangesOptions) -> Array:
     """Return the ranges (n,) in the unit of the file, row by row; one that is not positive means no measurement."""
     if columns == ["range"] and "range" not in table:
         return _ranges_by_stamps(table, StampOptions.from_log_options(options))

@@ -33,29 +33,31 @@ class Guess:
     """Guess of what a table holds.
 
     Attributes:
-        columns: by quantity, the name of its column in the file.
-        wide: columns of ranges, each with its anchor and tag.
+        columns: by quantity, the name of its column in the file, as the user would give them: ``range:A1`` or
+            ``range:A1:T0`` for a column with the ranges of one anchor, ``range:@id`` where the column id names it.
         roles: what the log says about the two ends of a range.
         notes: lines for the user about what was found.
         doubts: why the guess is not sure; empty if it is.
         missing: quantities for which no column was found.
-        wide_in_short: ``wide`` as the user would give it, if its columns have no names: quantity and columns.
     """
 
     columns: dict[str, str] = field(default_factory=dict)
-    wide: dict[str, tuple[str, str]] = field(default_factory=dict)
     roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
-    wide_in_short: dict[str, str] = field(default_factory=dict)
 
     @property
     def told(self) -> dict[str, str]:
-        """The guess in the form in which the user would give the columns."""
-        wide = {f"range:{anchor}" + f":{tag}" * bool(tag): name for name, (anchor, tag) in self.wide.items()}
-        columns = dict(sorted(self.columns.items(), key=lambda item: item[0] != "timestamp"))
-        return {**columns, **(self.wide_in_short or wide)}
+        """The columns in the order in which a user would give them: the time first, those of single anchors last."""
+        return dict(
+            sorted(self.columns.items(), key=lambda item: (item[0].startswith("range:"), item[0] != "timestamp"))
+        )
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether there are columns with the ranges of one anchor each."""
+        return any(quantity.startswith("range:") for quantity in self.columns)
 
 
 def guess_columns(layout: Layout) -> Guess:
@@ -144,8 +146,13 @@ def _find_pairs(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
 
 
 def _take_pairs(pairs: Sequence[tuple[ColumnSample, ColumnSample]], guess: Guess) -> None:
-    guess.wide = {value.name: (f"@{node.name}", "") for node, value in pairs}
+    guess.columns |= {f"range:@{node.name}": value.name for node, value in pairs}
     guess.notes.append(f"an anchor and its range in {len(pairs)} pairs of columns, such as {pairs[0][0].name}")
+
+
+def _of_link(anchor: str, tag: str) -> str:
+    """Return the quantity of the ranges between an anchor and a tag; without a tag, of those to the anchor."""
+    return f"range:{anchor}" + f":{tag}" * bool(tag)
 
 
 def _names_anchor(column: ColumnSample) -> bool:
@@ -166,7 +173,7 @@ def _without_numbers(column: ColumnSample) -> tuple[str, ...]:
 
 
 def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
-    if guess.wide:
+    if guess.is_wide:
         return free
     numbers = [column for column in free if column.kind == "numbers" and not terms.NO_RANGE & {*column.words}]
     numbers = [column for column in numbers if not _is_angle(column)]
@@ -234,17 +241,23 @@ def _may_be_wide(member: tuple[ColumnSample, list[int]]) -> bool:
 
 
 def _take_wide(group: list[tuple[ColumnSample, list[int]]], guess: Guess) -> None:
+    wide, nums_of_ids, have_tags = dict[str, str](), set[int](), False
     for column, ids in group:
         tags = [k for k in ids if k and column.words[k - 1] in terms.TAG | {"t"} and len(ids) > 1]
         anchors = [k for k in ids if k not in tags]
         anchor, tag = ("_".join(_id_at(column.words, k, column.name) for k in each) for each in (anchors, tags))
-        guess.wide[column.name] = (anchor, tag)
+        wide[_of_link(anchor, tag)] = column.name
+        nums_of_ids.add(len(ids) - bool(tags))
+        have_tags |= bool(tags)
+    guess.columns |= wide
     words = {word for column, _ in group for word in column.words}
     first = _names(column for column, _ in group[:4])
     guess.notes.append(f"one column per anchor: {first}{', ..' * (len(group) > 4)}")
-    if any(len(ids) - bool(guess.wide[column.name][1]) > 1 for column, ids in group):
+    if len(wide) < len(group):
+        guess.doubts.append("the names of several columns hold the same id")
+    elif max(nums_of_ids) > 1:
         guess.doubts.append("the names of the columns hold two ids, and do not say which is the anchor's")
-    elif not any(tag for _, tag in guess.wide.values()) and not words & (
+    elif not have_tags and not words & (
         terms.RANGE | terms.RANGE_IN_SHORT | (terms.ANCHOR - {"an", "bs", "node", "base"})
     ):
         guess.doubts.append("the names of the columns do not say that they are ranges")
@@ -273,7 +286,7 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     anchor, tag = ids["anchor"] or ids["asked"], ids["tag"] or ids["asking"]
     nameless = ids["any"]
     varying = [column for column in free if _is_id(column) and column.num_distinct > 1]
-    if guess.wide:
+    if guess.is_wide:
         tag = tag or nameless[:1]
     elif not anchor and nameless:
         others = [column for column in varying if column not in nameless and _ends_in_id(column)]
@@ -291,16 +304,16 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
         else EndpointRoles.TAG_AND_ANCHOR
     )
     anchor, tag = by_id_rather_than_index(anchor), by_id_rather_than_index(tag)
-    if guess.wide and max(len([column for column in anchor if column in varying]), len(nameless)) > 1:
+    if guess.is_wide and max(len([column for column in anchor if column in varying]), len(nameless)) > 1:
         guess.doubts.append("the anchor of a column of ranges seems to be given in another column")
     for role, columns in (("anchor_id", anchor), ("tag_id", tag), ("antenna", ids["antenna"][: bool(tag)])):
-        if columns and not (guess.wide and role == "anchor_id"):
+        if columns and not (guess.is_wide and role == "anchor_id"):
             guess.columns[role] = columns[0].name
             if len(columns) > 1:
                 guess.doubts.append(f"any of {_names(columns)} may be the {role}")
     unlike = terms.NO_RANGE - terms.ANY_ID
     others = [column for column in varying if not unlike & {*column.words}]
-    if others and not (guess.wide or anchor):
+    if others and not (guess.is_wide or anchor):
         guess.columns["anchor_id"] = others[0].name
         guess.doubts.append(f"{others[0].name} may be the anchor")
     if "antenna" in guess.columns and ids["antenna"][0].num_distinct > 1:
@@ -342,7 +355,7 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
             guess.missing.append("timestamp")
         if rising and rising[0].is_whole and fractions:
             guess.columns["nanoseconds"] = fractions[0].name
-    if guess.wide or {"range", "tx1"} & {*guess.columns}:
+    if guess.is_wide or {"range", "tx1"} & {*guess.columns}:
         return
     free = [column for column in _before_position(free) if not terms.POSE & {*column.words}]
     pairs = _pairs_by_values(free)
@@ -434,10 +447,11 @@ def _wide_by_values(columns: list[ColumnSample], guess: Guess) -> None:
     are_numbered = all(name.isdigit() for name in names)
     ids = [(str(k // num_tags), f"T{k % num_tags}" if num_tags > 1 else "") for k in range(len(columns))]
     ids = ids if are_numbered or num_tags > 1 else [(name, "") for name in names]
-    guess.wide = dict(zip(names, ids))
     if are_numbered and int(names[-1]) - int(names[0]) == len(names) - 1:
-        of_tags = f":T0-T{num_tags - 1}" * (num_tags > 1)
-        guess.wide_in_short = {f"range:0-{num - 1}{of_tags}": f"{names[0]}-{names[-1]}"}
+        of_tags = f"T0-T{num_tags - 1}" * (num_tags > 1)
+        guess.columns[_of_link(f"0-{num - 1}", of_tags)] = f"{names[0]}-{names[-1]}"
+    else:
+        guess.columns |= {_of_link(*link): name for link, name in zip(ids, names)}
     tags = f", each for {num_tags} tags, whose ranges are nearly the same" if num_tags > 1 else ""
     guess.doubts.append(f"columns {names[0]} to {names[-1]} may be ranges to {num} anchors{tags}")
 

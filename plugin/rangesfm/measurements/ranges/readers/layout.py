@@ -81,51 +81,22 @@ _MIN_SHARE_NAMED, _MIN_SHARE_JSON = 0.9, 0.5
 
 
 @dataclass(frozen=True)
-class Cure:
-    """Conversion of the cells of a column to the usual form; a cell that has another form is left as it is.
-
-    Attributes:
-        unit: unit after each number, which is removed.
-        thousands: characters that set thousands apart, which are removed; "" if there are none.
-        commas: whether numbers have decimal commas.
-        are_dates: whether the cells are dates in another form than 2026-01-31.
-        are_angles: whether the cells are degrees, minutes and seconds.
-    """
-
-    unit: str = ""
-    thousands: str = ""
-    commas: bool = False
-    are_dates: bool = False
-    are_angles: bool = False
-
-    def __call__(self, cell: str) -> str:
-        if self.are_dates:
-            return spelt_date(cell) or cell
-        if self.are_angles:
-            return cell if (angle := _spelt_angle(cell)) is None else f"{angle:.12g}"
-        found = _WITH_UNIT.fullmatch(cell) if self.unit else None
-        number = found[1] if found and found[2] == self.unit else cell
-        if self.thousands and _GROUPED.fullmatch(number):
-            number = re.sub(f"[{re.escape(self.thousands)}]", "", number).replace(",", ".")
-        return number.replace(",", ".") if self.commas and _DECIMAL_COMMA.fullmatch(number) else number
-
-
-NO_CURE = Cure()
-
-
-@dataclass(frozen=True)
 class ColumnSample:
     """A column with its name and its first cells.
 
     Attributes:
-        unit: unit after each of its numbers, "" if there is none.
-        cure: conversion of its cells, which has been applied to ``cells``.
+        unit: unit after each of its numbers in the file, "" if there is none.
+        thousands: characters that set thousands apart there, "" if there are none.
+        has_commas: whether numbers have decimal commas there.
+        spelling: what the cells are in another form there: "dates", "angles" in degrees, minutes and seconds, or "".
     """
 
     name: str
     cells: tuple[str, ...]
     unit: str = ""
-    cure: Cure = NO_CURE
+    thousands: str = ""
+    has_commas: bool = False
+    spelling: str = ""
 
     @cached_property
     def words(self) -> list[str]:
@@ -170,22 +141,41 @@ class ColumnSample:
     def names_photos(self) -> bool:
         return bool(self.cells) and all(cell.lower().endswith(IMAGE_EXTENSIONS) for cell in self.cells)
 
-    def cured(self) -> ColumnSample:
-        """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
-        if self.filled and all(map(spelt_date, self.filled)):
-            return self._with(Cure(are_dates=True))
-        if self.filled and not any(_spelt_angle(cell) is None for cell in self.filled):
-            return self._with(Cure(are_angles=True))
-        units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
-        unit = next(iter(units)) if len(units) == 1 else ""
-        cure = Cure(unit if unit.lower() in _UNITS else "")
-        cells = [*map(cure, self.filled)]
-        apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
-        cure = replace(cure, thousands=next(apart, ""), commas=any(map(_DECIMAL_COMMA.fullmatch, cells)))
-        return self if cure == NO_CURE else self._with(cure)
+    @property
+    def is_usual(self) -> bool:
+        """Whether its cells in the file have the usual form, as far as is known."""
+        return not (self.unit or self.thousands or self.has_commas or self.spelling)
 
-    def _with(self, cure: Cure) -> ColumnSample:
-        return replace(self, cells=tuple(map(cure, self.cells)), unit=cure.unit, cure=cure)
+    def usual(self, cell: str) -> str:
+        """Convert a cell of the column in the file to the usual form: decimal points, no units, 2026-01-31.
+
+        A cell that has another form than the others is left as it is.
+        """
+        if self.spelling == "dates":
+            return spelt_date(cell) or cell
+        if self.spelling == "angles":
+            return cell if (angle := _spelt_angle(cell)) is None else f"{angle:.12g}"
+        found = _WITH_UNIT.fullmatch(cell) if self.unit else None
+        number = found[1] if found and found[2] == self.unit else cell
+        if self.thousands and _GROUPED.fullmatch(number):
+            number = re.sub(f"[{re.escape(self.thousands)}]", "", number).replace(",", ".")
+        return number.replace(",", ".") if self.has_commas and _DECIMAL_COMMA.fullmatch(number) else number
+
+    def in_usual_form(self) -> ColumnSample:
+        """Return the column with the form of its cells found out, and these in the usual form."""
+        if self.filled and all(map(spelt_date, self.filled)):
+            column = replace(self, spelling="dates")
+        elif self.filled and not any(_spelt_angle(cell) is None for cell in self.filled):
+            column = replace(self, spelling="angles")
+        else:
+            units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
+            unit = next(iter(units)) if len(units) == 1 else ""
+            column = replace(self, unit=unit if unit.lower() in _UNITS else "")
+            cells = [*map(column.usual, self.filled)]
+            apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
+            has_commas = any(map(_DECIMAL_COMMA.fullmatch, cells))
+            column = replace(column, thousands=next(apart, ""), has_commas=has_commas)
+        return self if column.is_usual else replace(column, cells=tuple(map(column.usual, self.cells)))
 
     def __str__(self) -> str:
         if self.kind == "numbers" and len(self.numbers):
@@ -226,14 +216,13 @@ class Layout:
             InputError: lines are not rows of the table.
         """
         table = self.read_cells(every_row)
-        cures = {column.name: column.cure for column in self.columns if column.cure != NO_CURE}
-        cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
+        unusual = [column for column in self.columns if not column.is_usual]
         return replace(
             table,
-            cells={**table.cells, **cured},
+            cells={**table.cells, **{one.name: [*map(one.usual, table.text(one.name, empty=""))] for one in unusual}},
             units={column.name: column.unit for column in self.columns},
             missing=MISSING,
-            notes=(*table.notes, *["numbers have decimal commas"] * any(cure.commas for cure in cures.values())),
+            notes=(*table.notes, *["numbers have decimal commas"] * any(one.has_commas for one in unusual)),
         )
 
 
@@ -249,7 +238,7 @@ def find_layout(path: Path, separator: str = "") -> Layout | None:
     """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
         first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.cells)
-        return Layout(tuple(column.cured() for column in first_rows), True, lambda _: table, True)
+        return Layout(tuple(column.in_usual_form() for column in first_rows), True, lambda _: table, True)
     lines = read_head(path).split("\n")
     # The last line may be cut off, where the beginning ends or the recording did, but not in a short list.
     whole = lines if len(lines) <= _MOST_OF_LIST else lines[:-1]
@@ -287,7 +276,10 @@ def find_layout(path: Path, separator: str = "") -> Layout | None:
     columns = (ColumnSample(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
     header_row = rows[first] if num_skipped >= content[first][0] else ()
     return Layout(
-        tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
+        tuple(
+            column if separator == "," and "," in "".join(column.cells) else column.in_usual_form()
+            for column in columns
+        ),
         names is not None,
         lambda every_row: read_rows(path, header, separator, num_skipped, header_row, every_row=every_row),
     )
@@ -362,8 +354,8 @@ def _is_header(row: list[str], rows: list[list[str]]) -> bool:
 
     Whole numbers may be names, as ids of anchors are, if another cell of the row is a word.
     """
-    below = [ColumnSample("", tuple(cells)).cured() for cells in zip(*rows)]
-    cells = [ColumnSample("", (cell,)).cured() for cell in row]
+    below = [ColumnSample("", tuple(cells)).in_usual_form() for cells in zip(*rows)]
+    cells = [ColumnSample("", (cell,)).in_usual_form() for cell in row]
     if not rows:
         return all(cell.kind == "text" for cell in cells)
     of_values = [cell for cell, column in zip(cells, below) if column.kind in ("numbers", "times")]

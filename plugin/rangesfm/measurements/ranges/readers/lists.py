@@ -6,9 +6,7 @@ row of a list counts: a line that is not a row of the table is an error.
 
 from __future__ import annotations
 
-import re
-import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +18,8 @@ from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import NO_CURE, ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError, columns_typed
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE, named_length_unit
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.text_tables import (
@@ -35,77 +34,16 @@ from rangesfm.util.files.text_tables import (
 )
 
 AXES = ("x", "y", "z")
-_MAX_NUM_WAYS = 6  # ways to read a list that are offered
 # Largest plausible median time between two photos or positions, in seconds.
 _SLOWEST_S = 120.0
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One way to read a list.
-
-    Attributes:
-        when: the case in which it is right, for the user.
-        flags: flags and their values that choose it.
-    """
-
-    when: str
-    flags: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.when}, add {shlex.join(self.flags)}"
-
-
-class UnclearListError(InputError):
-    """A list whose columns or units are not known for sure. The advice gives the flags for each way to read it.
-
-    Attributes:
-        what: the kind of list, such as "anchors".
-        choices: the ways to read it.
-        about: lines that say what was found, and what is not sure.
-    """
-
-    def __init__(self, what: str, path: Path, layout: Layout, why: Sequence[str], choices: Sequence[Choice]):
-        self.what, self.choices, self._layout, self._why = what, tuple(choices), layout, tuple(why)
-        self.about = (f"found: {', '.join(described(layout.columns))}", f"not sure: {'; '.join(why)}")
-        self.message = f"a table of {what} whose columns are not known for sure"
-        super().__init__(self.message, path, advice=[*self.about, *map(str, self.choices)])
-
-    def about_other(self, what: str, quantities: Mapping[str, str], flags: Mapping[str, str]) -> UnclearListError:
-        """Return the same error about another kind of list, with its quantities and flags in place of these."""
-        choices = [
-            Choice(choice.when, tuple(_renamed(flag, quantities, flags) for flag in choice.flags))
-            for choice in self.choices
-        ]
-        assert self.path is not None
-        return UnclearListError(what, Path(self.path), self._layout, self._why, choices)
-
-    def asking(self, questions: Sequence[str]) -> InputError:
-        """Return an error with the same text and other advice."""
-        return InputError(self.message, self.path, advice=questions)
-
-
-def _renamed(text: str, quantities: Mapping[str, str], flags: Mapping[str, str]) -> str:
-    for old, new in flags.items():
-        text = new + text.removeprefix(old) if text.startswith(old) else text
-    for old, new in quantities.items():
-        text = re.sub(rf"(^|,){old}=", rf"\g<1>{new}=", text)
-    return text
-
-
-def ways_to_complete(
-    columns: Mapping[str, str], candidates: Mapping[str, Sequence[str]]
-) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the ways to give all quantities columns of their own, each after the case in which it is right.
-
-    Args:
-        columns: name of the column of each quantity that is known.
-        candidates: names of the columns that may hold each of the others.
-    """
-    ways = [way for way in product(*candidates.values()) if len({*way}) == len(way)]
-    for way in ways if candidates and len(ways) <= _MAX_NUM_WAYS else ():
-        more = dict(zip(candidates, way, strict=True))
-        yield f"if {' and '.join(f'{name} is {quantity}' for quantity, name in more.items())}", {**columns, **more}
+def unclear_table(
+    what: str, path: Path, layout: Layout, why: Sequence[str], choices: Sequence[Choice]
+) -> UnclearFileError:
+    """Return the error that asks how a table is to be read; ``why`` says what is not sure."""
+    about = (f"found: {', '.join(described(layout.columns))}", f"not sure: {'; '.join(why)}")
+    return UnclearFileError(what, path, about, choices)
 
 
 def coordinates_of_point(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
@@ -128,19 +66,22 @@ class TableForm:
         what: what it lists, for messages.
         names: name of the column of each quantity in the canonical CSV. Those of lengths end in ``_m``.
         required: quantities that it must have, such as "x", or "timestamp or image_name" of which one is enough.
-        find: returns the name of the column of each quantity in another table, or None if it is no such table.
+        find: returns the name of the column of each quantity in another table, or None if it is no such table, given
+            this form, the file and its layout.
         flag: by which the user gives the columns; empty if one cannot.
         also: quantities that only other tables have.
         aliases: other names of columns in the canonical CSV, as for ``read_table``.
+        own: quantities that ``find`` calls otherwise, by its names.
     """
 
     what: str
     names: Mapping[str, str]
     required: Sequence[str]
-    find: Callable[[Path, Layout], Mapping[str, str] | None]
+    find: Callable[[TableForm, Path, Layout], Mapping[str, str] | None]
     flag: str = ""
     also: Sequence[str] = ()
     aliases: Mapping[str, str] = field(default_factory=dict)
+    own: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def _ways(self) -> list[list[str]]:
@@ -153,10 +94,20 @@ class TableForm:
         """All quantities that such a table may have."""
         return (*self.names, *self.also)
 
-    def choice(self, when: str, columns: Mapping[str, str], *flags: str) -> Choice:
-        """Return a way to read a table, by the columns of quantities and further flags."""
-        typed = ",".join(f"{quantity}={columns[quantity]}" for quantity in self.quantities if quantity in columns)
-        return Choice(when, (f"--{self.flag}", typed, *flags))
+    def choice(self, when: str, columns: Mapping[str, str], **flags: str) -> Choice:
+        """Return a way to read a table, by the columns of quantities and other flags for the same table."""
+        columns, table = self._by_own_names(columns), self.flag.removesuffix("columns")
+        typed = {quantity: columns[quantity] for quantity in self.quantities if quantity in columns}
+        return Choice(when, {self.flag: columns_typed(typed), **{table + flag: value for flag, value in flags.items()}})
+
+    def find_columns(self, path: Path, layout: Layout) -> Mapping[str, str] | None:
+        """Return the name of the column of each quantity, None if the file is no such table; errors as of ``find``."""
+        found = self.find(self, path, layout)
+        return None if found is None else self._by_own_names(found)
+
+    def _by_own_names(self, columns: Mapping[str, str]) -> dict[str, str]:
+        named = {self.own.get(quantity, quantity): name for quantity, name in columns.items()}
+        return {quantity: name for quantity, name in named.items() if quantity in self.quantities}
 
     @property
     def expected(self) -> str:
@@ -178,7 +129,7 @@ class TableForm:
         if layout is None:
             return self.is_canonical(read_head(path))
         try:
-            return layout.has_names and self.find(path, layout) is not None
+            return layout.has_names and self.find_columns(path, layout) is not None
         except InputError:
             return False
 
@@ -201,7 +152,7 @@ class TableForm:
             every_row: whether a line that is not a row of the table is an error. Otherwise a few are left out.
 
         Raises:
-            UnclearListError: the columns are not known for sure; the advice says what to type.
+            UnclearFileError: the columns are not known for sure; the advice says what to type.
             InputError: the file is no such table, or a line is not a row of it.
         """
         if not columns and unit is None and self.is_canonical(read_head(path)):
@@ -210,15 +161,16 @@ class TableForm:
         if layout is None:
             found = f"no table of {self.what}" if read_head(path).strip() else "the file is empty"
             raise InputError(f"{found}, {self.expected}", path)
-        taken = self._columns_by_user(columns, layout, path) if columns else self.find(path, layout)
+        taken = self._columns_by_user(columns, layout, path) if columns else self.find_columns(path, layout)
         if taken is None:
             found = printable(", ".join(layout.names))
             raise InputError(f"no columns of {self.what}; found {found}; {self.expected}", path)
         table = layout.read(every_row=every_row)
         # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
-        uncured = [column for column in layout.columns if column.name in taken.values() and column.cure == NO_CURE]
-        cures = {column.name: column.cured().cure for column in uncured}
-        cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items() if cure != NO_CURE}
+        left = [
+            column.in_usual_form() for column in layout.columns if column.name in taken.values() and column.is_usual
+        ]
+        cells = {one.name: [*map(one.usual, table.text(one.name, empty=""))] for one in left if not one.is_usual}
         unused = printable(", ".join(name for name in layout.names if name not in taken.values()))
         notes = (
             columns_taken(taken, layout.has_names or bool(columns)) + f"; not used: {unused}" * bool(unused),
@@ -284,19 +236,19 @@ def times_by_row(table: TextTable, what: str, said: str | None, flag: str) -> tu
     """Return the times (n,) of photos or of positions in seconds, their unit, and lines for the user.
 
     Args:
-        what: what the table lists. said: unit that the user gave. flag: by which one gives it.
+        what: what the table lists. said: unit that the user gave. flag: by which one gives it, without dashes.
 
     Raises:
-        UnclearListError: the unit is not known for sure.
+        UnclearFileError: the unit is not known for sure.
         InputError: a cell is not a time.
     """
     notes = list[str]()
 
     def ask(units: Sequence[str], why: str) -> InputError:
-        choices = [Choice(f"if they are {one}", (flag, one)) for one in units]
+        choices = [Choice(f"if they are {one}", {flag: one}) for one in units]
         layout = find_layout(table.path)
         assert layout is not None
-        return UnclearListError(what, table.path, layout, [f"the times have {why}"], choices)
+        return unclear_table(what, table.path, layout, [f"the times have {why}"], choices)
 
     times_s, unit = read_timestamps(table, said, notes, ask, slowest_s=_SLOWEST_S)
     return times_s, unit, notes

@@ -14,6 +14,7 @@ import numpy as np
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
 from rangesfm.util.files.text_tables import MAX_NUMBER
 from rangesfm.util.geometry.moments import ByPhoto
 
@@ -90,11 +91,11 @@ def _have_all_bits(values: Array, share: float) -> Mask:
     return np.asarray(np.any((counted <= full * (1 + 1e-9)) & (counted >= full * (1 - 1e-9 - share)), axis=(1, 2)))
 
 
-def which_are_within_reach(ranges_m: Array, path: Path, advice: Sequence[str] = ()) -> tuple[Mask, tuple[str, ...]]:
+def which_are_within_reach(ranges_m: Array, path: Path, others: Sequence[Choice] = ()) -> tuple[Mask, tuple[str, ...]]:
     """Return which ranges (n,) a UWB radio can have measured, and notes about the others.
 
     Args:
-        advice: what to type if the unit is wrong.
+        others: ways to read the log if the unit is wrong.
 
     Raises:
         InputError: most of the ranges are beyond the reach of any radio, so that their unit is wrong.
@@ -105,7 +106,8 @@ def which_are_within_reach(ranges_m: Array, path: Path, advice: Sequence[str] = 
         return near, ()
     if 2 * num > len(ranges_m):
         message = f"most ranges are beyond {REACH_M:g} m, where no UWB radio reaches (half of them beyond "
-        raise InputError(f"{message}{np.median(ranges_m):.6g} m): is their unit right?", path, advice=advice)
+        message += f"{np.median(ranges_m):.6g} m): is their unit right?"
+        raise UnclearFileError("ranges", path, (), others, message)
     said = f"{num} range{'s are' if num > 1 else ' is'} beyond {REACH_M:g} m, where no UWB radio reaches"
     return near, (f"{said}, such as {ranges_m[~near][0]:.10g} m: taken to mean no measurement",)
 

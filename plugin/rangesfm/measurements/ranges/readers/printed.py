@@ -18,9 +18,10 @@ import numpy as np
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID
-from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader
 from rangesfm.measurements.ranges.readers.readings import Reading, reader_of_readings
 from rangesfm.measurements.ranges.readers.times import Clock
+from rangesfm.options import RangesOptions
 from rangesfm.util.files.text_tables import read_text
 
 LOST = Reading(0.0, "", math.nan)
@@ -56,7 +57,7 @@ def _reader(
     first, begun, phrase = (re.compile(pattern, re.ASCII | re.MULTILINE) for pattern in (begin, each, whole))
     has_time = "time" in phrase.groupindex
 
-    def readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+    def readings(path: Path, options: RangesOptions) -> Iterator[Reading]:
         clock, lost, num_found = Clock(options.timestamp_unit), (0, ""), 0
         for line, text in numbered_lines(path):
             num_begun = len(begun.findall(text))
@@ -202,7 +203,7 @@ _QORVO_MEASUREMENT = re.compile(
 )
 
 
-def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+def _qorvo_readings(path: Path, options: RangesOptions) -> Iterator[Reading]:
     """Yield the ranges with the host's time before a record, and the time by the radio's count of intervals."""
     text, clock, counted_s = read_text(path, errors="replace"), Clock(options.timestamp_unit), -math.inf
     begins = list(_QORVO_BEGIN.finditer(text))

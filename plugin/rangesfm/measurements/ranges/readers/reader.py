@@ -2,43 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
-
-
-class ReadOptions(RangesOptions):
-    """The user's options for reading a log."""
-
-    given: tuple[str, ...] = ()
-    """Paths of the log as the user gave them."""
-
-    def command(self, path: Path, **more: str) -> str:
-        """Return the command that reads the log with these options and some more."""
-        columns = ",".join(f"{quantity}={name}" for quantity, name in self.columns.items())
-        said = {"columns": columns, "timestamp_unit": self.timestamp_unit, "range_unit": self.range_unit}
-        flags = {**said, "separator": self.separator, **more}
-        typed = [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
-        return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
-
-    def which_unit(self, path: Path, quantity: str, units: Sequence[str], why: str) -> InputError:
-        """Return the error that asks for an ambiguous unit, with the command for each possible unit.
-
-        Args:
-            quantity: "range" or "timestamp".
-            why: what was found.
-        """
-        flag, either = f"{quantity}_unit", " or ".join(units)
-        message = f"the {quantity} has {why}, which may be {either}; say which by --{flag} (in a survey file: {flag})"
-        return InputError(message, path, advice=[self.command(path, **{flag: unit}) for unit in units])
 
 
 class EndpointRoles(Enum):
@@ -62,7 +34,7 @@ class Reader:
 
     name: str
     recognizes: Callable[[str], bool]
-    read: Callable[[Path, ReadOptions], RangeLog]
+    read: Callable[[Path, RangesOptions], RangeLog]
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: ()
     roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR
 

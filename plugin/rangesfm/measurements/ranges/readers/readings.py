@@ -17,10 +17,10 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.measurements.ranges.readers.counters import continued
 from rangesfm.measurements.ranges.readers.measured import which_are_measured, which_are_within_reach
-from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
-from rangesfm.measurements.ranges.readers.units import SLOWEST_S, time_unit
-from rangesfm.options import TIME_S
+from rangesfm.measurements.ranges.readers.units import SLOWEST_S, time_unit, which_unit
+from rangesfm.options import TIME_S, RangesOptions
 
 
 class Reading(NamedTuple):
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
     counted_s: float = math.nan
 
 
-def refuse_options_of_tables(options: ReadOptions, path: Path) -> None:
+def refuse_options_of_tables(options: RangesOptions, path: Path) -> None:
     """Raise InputError if options are given that only tables have."""
     if options.columns or options.range_unit is not None or options.separator:
         message = "the log's format is not a table: columns, range_unit and separator cannot be given"
@@ -49,7 +49,7 @@ def refuse_options_of_tables(options: ReadOptions, path: Path) -> None:
 
 
 def log_of_readings(
-    found: Sequence[Reading], path: Path, options: ReadOptions, format: str, notes: Sequence[str] = ()
+    found: Sequence[Reading], path: Path, options: RangesOptions, format: str, notes: Sequence[str] = ()
 ) -> RangeLog:
     """Return the log of some ranges, without those that are no measurements.
 
@@ -92,7 +92,7 @@ def log_of_readings(
     )
 
 
-def _continued(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array, list[str]]:
+def _continued(times_s: Array, path: Path, options: RangesOptions) -> tuple[Array, list[str]]:
     """Return times (n,) in seconds, continued where a counter begins again, and notes.
 
     Whole numbers without a unit that are too far apart for seconds are ms or us since the board was started.
@@ -104,7 +104,7 @@ def _continued(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array,
     distinct = np.unique(times_s)
     is_slow = len(distinct) > 1 and np.median(np.diff(distinct)) > SLOWEST_S
     if is_slow and options.timestamp_unit is None and np.all(distinct == np.round(distinct)):
-        ask = partial(options.which_unit, path, "timestamp")
+        ask = partial(which_unit, path, "timestamp")
         times_s = times_s * SECONDS_PER_UNIT[time_unit("the time", times_s, notes, ask)]
     return times_s, notes
 
@@ -112,13 +112,13 @@ def _continued(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array,
 def reader_of_readings(
     name: str,
     recognizes: Callable[[str], bool],
-    readings: Callable[[Path, ReadOptions], Iterable[Reading]],
+    readings: Callable[[Path, RangesOptions], Iterable[Reading]],
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: (),
     roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR,
 ) -> Reader:
     """Make the reader of a format that is not a table, from a function that yields its ranges."""
 
-    def read(path: Path, options: ReadOptions) -> RangeLog:
+    def read(path: Path, options: RangesOptions) -> RangeLog:
         refuse_options_of_tables(options, path)
         return log_of_readings(list(readings(path, options)), path, options, name)
 

@@ -8,22 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.errors import InputError
-from rangesfm.measurements.ranges.readers.reader import EndpointRoles, ReadOptions
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles
 from rangesfm.measurements.ranges.readers.readings import Reading, reader_of_readings
-from rangesfm.util.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
+from rangesfm.options import RangesOptions
+from rangesfm.util.files.bags import SQLITE_HEAD, connections_of, messages_of, open_bag, stamp_s, type_name, types_in
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
 _LED_NO_LINE_OF_SIGHT = 16
 
 
-def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+def _readings(path: Path, options: RangesOptions) -> Iterator[Reading]:
     """Yield the ranges in all messages, each with the 1-based number of its message as its line."""
     with open_bag(path) as bag:
-        connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
+        connections = connections_of(bag, _RANGES_IN)
         if not connections:
-            found = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "no messages"
-            raise InputError(f"no ranges in this bag; it has {found}, expected one of {', '.join(_RANGES_IN)}", path)
+            expected = f"expected one of {', '.join(_RANGES_IN)}"
+            raise InputError(f"no ranges in this bag; it has {types_in(bag)}, {expected}", path)
         for number, (kind, message, received_s) in enumerate(messages_of(bag, connections), 1):
             try:
                 readings = list(_RANGES_IN[type_name(kind)](message))
@@ -57,8 +58,7 @@ def _linktrack_tagframe(message: Any) -> Iterator[Reading]:
         yield Reading(0.0, str(slot), float(range_m), tag_id=str(message.id))
 
 
-# Functions that return the ranges of a message, by the last part of the type's name, because any package may define the
-# type. A time of 0 is not set, and the time of arrival is used instead.
+# Functions that return the ranges of a message, by its type. A time of 0 is not set, and the time of arrival is used.
 _RANGES_IN: dict[str, Callable[[Any], Iterable[Reading]]] = {
     "RangeStamped": lambda each: [_stamped(each, each.to_id, each.range, each.from_id, _root(each.covariance))],
     "TwoWayRangeStamped": _two_way_range_stamped,

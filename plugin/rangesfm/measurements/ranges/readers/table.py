@@ -21,9 +21,11 @@ from rangesfm.measurements.ranges.readers.columns import CANONICAL, QUANTITIES, 
 from rangesfm.measurements.ranges.readers.guess import Guess, described, guess_columns
 from rangesfm.measurements.ranges.readers.layout import Layout, are_quaternions, find_layout, read_rows
 from rangesfm.measurements.ranges.readers.lists import TableForm, columns_taken
-from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader
+from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError, columns_typed
+from rangesfm.options import RangesOptions
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.text_tables import TextTable, header_names, read_head, read_table, write_user_table
+from rangesfm.util.files.text_tables import header_names, read_head, read_table, write_user_table
 from rangesfm.util.geometry.moments import ByTime
 
 _FORM = TableForm(
@@ -38,7 +40,7 @@ _FORM = TableForm(
         "los": "los",
     },
     ("timestamp or image_name", "anchor_id", "range"),
-    lambda path, layout: None,
+    lambda form, path, layout: None,
 )
 _PRESETS = {
     "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
@@ -78,7 +80,7 @@ def _anchor_of_file(path: Path) -> str:
     return found[1] if found else stem
 
 
-def table_reader(path: Path, options: ReadOptions) -> Reader:
+def table_reader(path: Path, options: RangesOptions) -> Reader:
     """Return the reader of a table whose columns are recognized by names and values.
 
     Raises:
@@ -92,32 +94,13 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
         raise InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
     guess = guess_columns(layout)
     if guess.missing or guess.doubts or (not layout.has_names and _is_trajectory(layout)):
-        raise _question(path, options, layout, guess)
+        raise _question(path, layout, guess)
+    notes = tuple(_notes(path, layout, guess))
 
-    def read(path: Path, options: ReadOptions) -> RangeLog:
-        table = _rows(layout, {**guess.columns, **_columns_of_wide(guess.wide)})
-        table = replace(table, notes=(*_notes(path, layout, guess), *table.notes))
-        return _log(table, options, TABLE.name, guess.wide)
+    def read(path: Path, options: RangesOptions) -> RangeLog:
+        return _read(path, options, TABLE.name, guess.columns, layout, notes)
 
     return replace(TABLE, read=read, roles=guess.roles)
-
-
-def _rows(layout: Layout, columns: Mapping[str, str]) -> TextTable:
-    table = layout.read().by_quantity(columns)
-    if layout.are_records and "range" in table:  # records without a range are about something else
-        table = table.where([cell != "" for cell in table.text("range", empty="")])
-    return table
-
-
-def _columns_of_wide(wide: Mapping[str, tuple[str, str]]) -> dict[str, str]:
-    """Return the names of the columns of ranges of one anchor, and of those with the ids of these anchors."""
-    anchors = {anchor_id: anchor_id[1:] for anchor_id, _ in wide.values() if anchor_id.startswith("@")}
-    return {**{f"range:{name}": name for name in wide}, **anchors}
-
-
-def _log(table: TextTable, options: ReadOptions, format: str, wide: Mapping[str, tuple[str, str]]) -> RangeLog:
-    by_quantity = {f"range:{name}": ids for name, ids in wide.items()}
-    return read_columns(table, options, format, wide=by_quantity, anchor_id=_anchor_of_file(table.path))
 
 
 def _is_trajectory(layout: Layout) -> bool:
@@ -127,9 +110,10 @@ def _is_trajectory(layout: Layout) -> bool:
 
 
 def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
-    yield columns_taken(guess.columns, layout.has_names)
+    found = {quantity: name for quantity, name in guess.columns.items() if not quantity.startswith("range:")}
+    yield columns_taken(found, layout.has_names)
     yield from guess.notes
-    if "anchor_id" not in guess.columns and not guess.wide:
+    if "anchor_id" not in found and not guess.is_wide:
         yield f"no column gives the anchor: it is named '{_anchor_of_file(path)}' after the file"
 
 
@@ -144,31 +128,27 @@ def _refuse_other_logs(path: Path, known: Iterable[tuple[re.Pattern[str], str]])
         raise InputError(f"the log {instead}", path)
 
 
-def _question(path: Path, options: ReadOptions, layout: Layout, guess: Guess) -> InputError:
+def _question(path: Path, layout: Layout, guess: Guess) -> InputError:
     if _is_trajectory(layout):
         return InputError("holds poses over time (a trajectory) and no ranges", path)
     _refuse_other_logs(path, _NO_RANGES if "range" in guess.missing else _NO_RANGES[:1])
-    found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
     why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
-    commands = [options.changed(columns=columns).command(path) for columns in _possible_columns(layout, guess)]
     last = "perhaps" if guess.missing else "if that is right"
+    choices = [Choice(last, {"columns": columns_typed(columns)}) for columns in _possible_columns(layout, guess)]
     nothing = f"no other column of numbers can be the {' or the '.join(guess.missing)}, which a log needs"
-    return InputError(
-        "a table whose columns are not known for sure",
-        path,
-        advice=[
-            found,
-            f"closest guess: {closest}",
-            f"not sure: {why}",
-            *([f"{last}: {command}" for command in commands] or [nothing]),
-        ],
+    about = (
+        f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}",
+        f"closest guess: {closest}",
+        f"not sure: {why}",
+        *([] if choices else [nothing]),
     )
+    return UnclearFileError(_FORM.what, path, about, choices, "a table whose columns are not known for sure")
 
 
 def _possible_columns(layout: Layout, guess: Guess) -> Iterable[dict[str, str]]:
     """Yield the columns of a guess, with a few columns of numbers in the place of those that it misses."""
-    taken = guess.told.values()
+    taken = guess.columns.values()
     free = [
         column.name
         for column in layout.columns
@@ -184,9 +164,29 @@ def _recognizes(format: str, head: str) -> bool:
     return set(_PRESETS[format].values()) <= set(header_names(head))
 
 
-def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
-    """Read a table by the columns of a preset and those that the user named."""
-    told = {**_PRESETS.get(format, {}), **options.columns}
+def _read_preset(format: str, path: Path, options: RangesOptions) -> RangeLog:
+    return _read(path, options, format, {**_PRESETS[format], **options.columns})
+
+
+def _read_mapped(path: Path, options: RangesOptions) -> RangeLog:
+    return _read(path, options, MAPPED.name, options.columns, find_layout(path, options.separator))
+
+
+def _read(
+    path: Path,
+    options: RangesOptions,
+    format: str,
+    told: Mapping[str, str],
+    layout: Layout | None = None,
+    notes: tuple[str, ...] = (),
+) -> RangeLog:
+    """Read a table by the columns that the user, a preset or a guess names.
+
+    Args:
+        told: name of the column of each quantity, as ``Guess.columns``.
+        layout: of the table; None: it has a header row, and cells between separators.
+        notes: lines for the user, before those on the rows.
+    """
     for quantity in (key.partition(":")[0] for key in told):
         if quantity not in QUANTITIES:
             message = f"quantity in columns is '{quantity}', expected one of {', '.join(QUANTITIES)}"
@@ -195,7 +195,6 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
         raise InputError("columns must name range, timestamp (or image_name) and anchor_id where there is one", path)
     wide = _wide(told, path)
     columns = {key: name for key, name in told.items() if not key.startswith("range:")}
-    layout = find_layout(path, options.separator) if format == MAPPED.name else None
     if layout is not None and not {*columns.values(), *wide} <= {*layout.names}:
         layout = None
     third_message = {}
@@ -207,27 +206,35 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
             raise InputError(f"columns name neither range nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    columns |= _columns_of_wide(wide)
+    columns |= {f"range:{name}": name for name in wide}
+    columns |= {anchor_id: anchor_id[1:] for anchor_id, _ in wide.values() if anchor_id.startswith("@")}
     required, optional = dict.fromkeys(columns.values()), [*third_message.values()]
     columns |= third_message
     if layout is not None:
-        table = _rows(layout, columns)
+        table = layout.read().by_quantity(columns)
+        if layout.are_records and "range" in table:  # records without a range are about something else
+            table = table.where([cell != "" for cell in table.text("range", empty="")])
     elif format == "inrol":
         table = read_rows(path, _INROLS_COLUMNS, " ").by_quantity(columns)
     else:
         table = read_table(path, [*required], optional, separator=options.separator).by_quantity(columns)
-    return _log(table, options, format, wide)
+    table = replace(table, notes=(*notes, *table.notes))
+    links = {f"range:{name}": ids for name, ids in wide.items()}
+    return read_columns(table, options, format, wide=links, anchor_id=_anchor_of_file(path))
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
     """Return the columns that belong to one anchor and one tag each, with the ids of these.
 
-    The user gives them one by one, as ``range:A1=d1``, or many at once, as ``range:0-7:T0-T2=2-25``.
+    They are given one by one, as ``range:A1=d1``, or many at once, as ``range:0-7:T0-T2=2-25``. After an @ comes the
+    column in which the anchor's id is.
     """
     wide: dict[str, tuple[str, str]] = {}
     for key, name in told.items():
         quantity, _, ids = key.partition(":")
-        if quantity == "range" and ids:
+        if quantity == "range" and ids.startswith("@"):
+            wide[name] = (ids, "")
+        elif quantity == "range" and ids:
             anchors, tags = (_spanned(part) for part in (ids.partition(":")[0], ids.partition(":")[2]))
             names = _spanned(name) if len(anchors) * len(tags) > 1 else [name]
             if len(names) != len(anchors) * len(tags):
@@ -269,7 +276,7 @@ def write_ranges_csv(log: RangeLog, path: AnyPath) -> None:
     write_user_table(Path(path), [*columns], zip(*columns.values()))
 
 
-def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
+def _read_canonical(path: Path, options: RangesOptions) -> RangeLog:
     if options.columns or options.timestamp_unit not in (None, "s"):
         raise InputError("the canonical CSV has fixed columns, with times in seconds; use format 'mapped'", path)
     return read_columns(_FORM.read_canonical(path, options.separator), options.changed(timestamp_unit=None), CANONICAL)
@@ -280,10 +287,10 @@ PRESETS = tuple(
     Reader(
         name,
         partial(_recognizes, name),
-        partial(_read, format=name),
+        partial(_read_preset, name),
         roles=EndpointRoles.ASKER_AND_ASKED if "from_id" in preset.values() else EndpointRoles.TAG_AND_ANCHOR,
     )
     for name, preset in _PRESETS.items()
 )
-MAPPED = Reader("mapped", lambda head: False, partial(_read, format="mapped"))
-TABLE = Reader("table", lambda head: False, partial(_read, format="table"))
+MAPPED = Reader("mapped", lambda head: False, _read_mapped)
+TABLE = replace(MAPPED, name="table")

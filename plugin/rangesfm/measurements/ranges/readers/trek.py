@@ -14,9 +14,10 @@ from pathlib import Path
 
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers.printed import LOST, numbered_lines
-from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader
 from rangesfm.measurements.ranges.readers.readings import Reading, log_of_readings, refuse_options_of_tables
 from rangesfm.measurements.ranges.readers.times import Clock
+from rangesfm.options import RangesOptions
 from rangesfm.util.files.text_tables import read_text
 
 _LINE = re.compile(
@@ -30,7 +31,7 @@ _NO_RANGE = (0, 0xFFFFFFFF)
 _BETWEEN_ANCHORS = {1: ("A0", "A1"), 2: ("A0", "A2"), 3: ("A1", "A2")}
 
 
-def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
+def _readings(path: Path, options: RangesOptions) -> Iterator[Reading]:
     """Yield the ranges with the time in front of a line, which is that of the host, and the radio's milliseconds."""
     clock, whole = Clock(options.timestamp_unit), [*_LINE.finditer(read_text(path, errors="replace"))]
     unused = "r" if any(line["kind"] == "c" for line in whole) else ""  # ``mr`` repeats the ranges of ``mc``
@@ -64,7 +65,7 @@ def _ranges(line: re.Match[str], is_masked: bool) -> Iterator[tuple[int, float]]
         yield slot, range_mm / 1000 if is_valid and is_pair and range_mm not in _NO_RANGE else 0.0
 
 
-def _read(path: Path, options: ReadOptions) -> RangeLog:
+def _read(path: Path, options: RangesOptions) -> RangeLog:
     refuse_options_of_tables(options, path)
     log = log_of_readings([*_readings(path, options)], path, options, _NAME)
     return log.with_anchors({node for node in (*log.tag_ids, *log.anchor_ids) if node.startswith("A")})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.measured import REACH_M
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT, unit_by_digits
+from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
 from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
 from rangesfm.util.files.clock_times import are_seconds_since_1970
 
@@ -42,6 +44,18 @@ _MAX_SHARE_OF_JUMPS = 0.25
 
 Ask = Callable[[Sequence[str], str], InputError]
 """Function that returns the error which asks for one of several units, given the units and what was found."""
+
+
+def which_unit(path: Path, quantity: str, units: Sequence[str], why: str) -> UnclearFileError:
+    """Return the error that asks for an ambiguous unit of a log.
+
+    Args:
+        quantity: "range" or "timestamp".
+        why: what was found.
+    """
+    flag, either = f"{quantity}_unit", " or ".join(units)
+    message = f"the {quantity} has {why}, which may be {either}; say which by --{flag} (in a survey file: {flag})"
+    return UnclearFileError("ranges", path, (), [Choice("", {flag: unit}) for unit in units], message)
 
 
 def time_unit(name: str, times: Array, notes: list[str], ask: Ask, slowest_s: float = SLOWEST_S) -> str:
