@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import pycolmap
@@ -56,7 +57,7 @@ class MapAtRest:
         pixel_stddev: standard deviation of a reprojection error's coordinate before the solution, the unit of the
             equations. pixel_stddev_at_rest: the same after it.
         reprojection_rms_px: root mean square length of the reprojection errors.
-        solutions: runs of the solver. is_still: whether the keyframes came to rest.
+        run: of the solver.
         bend_m, num_graph_steps: of the keyframe graph before.
     """
 
@@ -69,8 +70,7 @@ class MapAtRest:
     pixel_stddev: float
     pixel_stddev_at_rest: float
     reprojection_rms_px: float
-    solutions: tuple[SolverRun, ...]
-    is_still: bool
+    run: SolverRun
     bend_m: float
     num_graph_steps: int
 
@@ -81,7 +81,7 @@ class MapAtRest:
     @property
     def converged(self) -> bool:
         """Return whether the keyframes came to rest."""
-        return self.solutions[-1].converged and self.is_still
+        return self.run.converged and self.run.is_still
 
 
 def refine(problem: MapProblem, *, with_equations: bool = True) -> MapAtRest:
@@ -163,25 +163,24 @@ def _adjusted(
 ) -> MapAtRest:
     """Alternate between solving the full problem and estimating the noise from its residuals."""
     problem, blocks = replace(problem, kinds=start.kinds), start.state.blocks
-    solutions: list[SolverRun] = []
-    num_left = problem.options.max_num_iterations
+    runs, num_left = list[SolverRun](), problem.options.max_num_iterations
     for num_round in range(_MAX_NUM_ROUNDS):
         if num_round:
             rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(adjustment.pixel_stddev)
             blocks = straighten_again(problem, rays, blocks)
             adjustment = problem.of_photos(num_left)
         added = problem.add_to(adjustment, blocks)
-        solutions.append(solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * problem.smallest_stddev))
-        num_left -= solutions[-1].num_iterations
+        runs.append(solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * problem.smallest_stddev))
+        num_left -= runs[-1].num_iterations
         state = problem.state(added)
         blocks = state.blocks
         seen = problem.with_noise_of(state, start.num_absorbed)
-        if problem.change(seen) < SAME_NOISE or not solutions[-1].converged or num_left <= 0:
+        if problem.change(seen) < SAME_NOISE or not runs[-1].converged or num_left <= 0:
             break
         if num_round < _MAX_NUM_ROUNDS - 1:
             problem = seen
     tolerance_m = _MAX_LAST_MOVEMENT * problem.smallest_stddev
-    more, is_still = solve_until_still(adjustment, solutions[-1], tolerance_m, num_left)
+    run = solve_until_still(adjustment, reduce(SolverRun.then, runs), tolerance_m, num_left)
     return MapAtRest(
         problem=problem,
         state=problem.state(added),
@@ -192,8 +191,7 @@ def _adjusted(
         pixel_stddev=adjustment.pixel_stddev,
         pixel_stddev_at_rest=pixel_stddev_of(adjustment.adjuster, adjustment.num_reprojections),
         reprojection_rms_px=adjustment.reprojection_rms_px,
-        solutions=(*solutions, *more),
-        is_still=is_still,
+        run=run,
         bend_m=start.bend_m,
         num_graph_steps=start.num_steps,
     )

@@ -182,16 +182,16 @@ def summarize(rest: MapAtRest, covariance: MapErrors, bending_factor: float) -> 
         rest: the map at rest. covariance, bending_factor: as in the summary.
     """
     return RefineSummary(
-        num_iterations=sum(solution.num_iterations for solution in rest.solutions),
+        num_iterations=rest.run.num_iterations,
         num_graph_steps=rest.num_graph_steps,
         bend_m=rest.bend_m,
-        initial_cost=rest.solutions[0].initial_cost,
-        final_cost=rest.solutions[-1].final_cost,
+        initial_cost=rest.run.initial_cost,
+        final_cost=rest.run.final_cost,
         reprojection_rms_px=rest.reprojection_rms_px,
         pixel_stddev=rest.pixel_stddev,
-        seconds=sum(solution.seconds for solution in rest.solutions),
+        seconds=rest.run.seconds,
         converged=rest.converged,
-        message=rest.solutions[-1].message,
+        message=rest.run.message,
         misfits=ranges_of(rest.problem.measured).misfits(rest.state),
         ranges=refined_ranges(rest, rest.state, covariance),
         covariance=covariance,

@@ -290,11 +290,6 @@ class JointMap:
         """Return the same map with other measurements, placed elsewhere."""
         return join_kinds(kinds, self.path, placed, self.bending, is_at_rest=self.is_at_rest)
 
-    def without(self, kind: str, name: str) -> JointMap:
-        """Return the map at rest without one component of the errors of a kind."""
-        problem = self.problem.without(kind, name)
-        return replace(self, problem=problem, posterior=problem.posterior(is_refined=True))
-
     def of_log(self, before: RangeEstimate) -> RangeEstimate:
         """Return what is said of the ranges of the log; what was known before if none takes part."""
         for each in self.kinds:
@@ -303,10 +298,10 @@ class JointMap:
 
     def without_clocks(self) -> JointMap:
         """Return the map at rest without the errors of clocks, which its fit has estimated."""
-        found = self
+        problem = self.problem
         for each in self.kinds:
-            found = found.without(each.kind, each.clock) if each.clock else found
-        return found
+            problem = problem.without(each.kind, each.clock) if each.clock else problem
+        return replace(self, problem=problem, posterior=problem.posterior(is_refined=True))
 
     def concluded(self) -> JointMap:
         """Return the map with what it says of each kind."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,12 +51,12 @@ _MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
 
 @dataclass(frozen=True)
 class SolverRun:
-    """Result of a run of the solver.
+    """Result of a run of the solver, or of several one after the other.
 
     Attributes:
         num_iterations: successful and unsuccessful ones. initial_cost, final_cost: half the sum of squares, in pixels.
         seconds: time of the solver.
-        converged: whether it stopped by itself.
+        converged: whether it stopped by itself, at the end.
         is_still: whether the keyframes came to rest in free steps.
         is_stuck: whether free steps still promise a decrease that matters, but none of them succeeds.
         message: of the solver.
@@ -70,6 +70,15 @@ class SolverRun:
     is_still: bool
     is_stuck: bool
     message: str
+
+    def then(self, later: SolverRun) -> SolverRun:
+        """Return this run and a later one as one."""
+        return replace(
+            later,
+            num_iterations=self.num_iterations + later.num_iterations,
+            initial_cost=self.initial_cost,
+            seconds=self.seconds + later.seconds,
+        )
 
 
 @dataclass(frozen=True)
@@ -221,9 +230,7 @@ def _message(monitor: ConvergenceMonitor, tolerance_m: float, summary: Any) -> s
     return str(summary.message)
 
 
-def solve_until_still(
-    problem: BundleAdjustment, before: SolverRun, tolerance_m: float, num_left: int
-) -> tuple[list[SolverRun], bool]:
+def solve_until_still(problem: BundleAdjustment, before: SolverRun, tolerance_m: float, num_left: int) -> SolverRun:
     """Solve again from where the solver stopped, with a wide trust region, until the keyframes come to rest.
 
     A solver whose steps have become small reports convergence; only a free step shows whether that is true. Steps are
@@ -231,23 +238,21 @@ def solve_until_still(
     first, with the map held fixed.
 
     Args:
-        before: the solution so far. num_left: largest number of further iterations.
+        before: the run so far. num_left: largest number of further iterations.
 
     Returns:
-        the further solutions, and whether the keyframes came to rest at a minimum.
+        the whole run; the keyframes are still only if that is at a minimum.
     """
-    solutions: list[SolverRun] = []
-    is_over = is_still = before.is_still
-    centers = keyframe_centers(problem.metric)
+    run, is_over, centers = before, before.is_still, keyframe_centers(problem.metric)
     while not is_over and num_left > 0:
         _settle_radio(problem)
-        solutions.append(found := solve_bundle_adjustment(problem, tolerance_m))
+        found = solve_bundle_adjustment(problem, tolerance_m)
         num_left -= max(found.num_iterations, 1)
         last, centers = centers, keyframe_centers(problem.metric)
         is_at_rest = farthest(last, centers) <= tolerance_m
         is_over = found.is_still or is_at_rest
-        is_still = is_over and (found.is_still or not found.is_stuck)
-    return solutions, is_still
+        run = run.then(replace(found, is_still=is_over and (found.is_still or not found.is_stuck)))
+    return run
 
 
 def _settle_radio(problem: BundleAdjustment) -> None:

@@ -213,8 +213,8 @@ class ComponentLikelihood:
         negative = 0.5 * (log_determinant + determinant + float(self.off_m @ pulls) + float(off_median @ off_median))
         inverse -= (whitened @ spread) @ whitened.T
         inverse -= np.outer(pulls, pulls)
-        half = self._half
-        slopes = half.components @ (half.counts * inverse.take(half.places))
+        places, counts = self._upper_triangle
+        slopes = self._packed[:-1] @ (counts * inverse.take(places))
         return negative, np.exp(2 * logs) * slopes + off_median / self.spreads
 
     def mean_stddevs(self, logs: Array) -> Array:
@@ -230,14 +230,27 @@ class ComponentLikelihood:
         return np.asarray(np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2)))))
 
     @cached_property
-    def _half(self) -> _Half:
-        return _Half.packed(self.of_components, self.known)
+    def _upper_triangle(self) -> tuple[Indices, Array]:
+        """(h,) places of its elements in a symmetric (c, c) matrix, and (h,) how often each is in it."""
+        num = len(self.known)
+        places = np.flatnonzero(np.triu(np.ones((num, num))))
+        return places, np.where(places % (num + 1) == 0, 1.0, 2.0)
+
+    @cached_property
+    def _packed(self) -> Array:
+        """(k + 1, h) upper triangles of all components and of what is known, as their sums take most of the time."""
+        places, counts = self._upper_triangle
+        stacked = np.concatenate([self.of_components, self.known[None]])
+        packed = np.take(stacked.reshape(len(stacked), -1), places, axis=1)
+        # Rounding may leave a covariance singular, without this share of its trace on the diagonal.
+        packed[:, counts == 1.0] += ROUNDING * np.trace(stacked, axis1=1, axis2=2)[:, None]
+        return packed
 
     def _factored(self, logs: Array) -> tuple[float, Array]:
         """Return the log-determinant and the inverse (c, c) of the covariance."""
-        half, num = self._half, len(self.off_m)
+        num, (places, _) = len(self.off_m), self._upper_triangle
         covariance = np.zeros(num * num)
-        covariance[half.places] = np.exp(2 * logs) @ half.components + half.known
+        covariance[places] = np.exp(2 * logs) @ self._packed[:-1] + self._packed[-1]
         return _determinant_and_inverse(covariance.reshape(num, num))
 
     @cached_property
@@ -254,32 +267,6 @@ class ComponentLikelihood:
         information: Array = design.T @ whitened + prior_design.T @ prior_design
         determinant, covariance = _determinant_and_inverse(information)
         return whitened, covariance, determinant
-
-
-@dataclass(frozen=True)
-class _Half:
-    """The upper triangles of symmetric (c, c) matrices, as the sums over these take most of the time.
-
-    Attributes:
-        places: (h,) of the elements in a matrix. counts: (h,) how often each is in it.
-        components, known: (k, h) and (h,) elements, with what rounding needs added.
-    """
-
-    places: Indices
-    counts: Array
-    components: Array
-    known: Array
-
-    @classmethod
-    def packed(cls, components: Array, known: Array) -> _Half:
-        num = len(known)
-        places = np.flatnonzero(np.triu(np.ones((num, num))))
-        # Rounding may leave a covariance singular, without this share of its trace on the diagonal.
-        on_diagonal = places % (num + 1) == 0
-        stacked = np.concatenate([components, known[None]])
-        of_all = np.take(stacked.reshape(len(stacked), -1), places, axis=1)
-        of_all[:, on_diagonal] += ROUNDING * np.trace(stacked, axis1=1, axis2=2)[:, None]
-        return cls(places, np.where(on_diagonal, 1.0, 2.0), of_all[:-1], of_all[-1])
 
 
 def _determinant_and_inverse(upper: Array) -> tuple[float, Array]:
