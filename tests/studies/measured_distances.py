@@ -124,7 +124,7 @@ def measured_in(
 ) -> tuple[Measurement, ...]:
     assert metric.kept is not None
     anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
-    pixel_stddev = metric.kept.summary.pixel_stddev
+    pixel_stddev = metric.kept.pixel_stddev
     points = NamedPoints.in_model(metric.final, markers, anchors_m, pixel_stddev=pixel_stddev)
     up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
     return measured(points, pairs, metric.map_errors, metric.estimate.uncertainty.empirical, up)

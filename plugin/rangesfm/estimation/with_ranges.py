@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,9 @@ from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @with_one_blas_thread
@@ -165,7 +169,7 @@ class RefineSummary:
     covariance: MapErrors
     bending_factor: float
 
-    def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> RefineSummary:
+    def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> Self:
         """Return the summary with others of the anchors."""
         return replace(self, ranges=replace(self.ranges, anchors=anchors))
 

@@ -61,7 +61,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
     with sole_writer(run.survey.output.path) as output:
         if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return metric
-        if not metric.kept.summary.covariance.are_known:
+        if not metric.kept.covariance.are_known:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return metric
         if why_not := matching.why_unfit(metric.final):
@@ -87,8 +87,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
             )
         assert last.refined is not None, "a refined map"
         # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
-        summary = replace(last.refined.summary, bend_m=metric.kept.summary.bend_m)
-        return replace(last, refined=replace(last.refined, summary=summary, loops=loops))
+        return replace(last, refined=replace(last.refined, bend_m=metric.kept.bend_m, loops=loops))
 
 
 def close_loops_of_models(
@@ -178,9 +177,10 @@ def _close_in_rounds(
 
 
 def _finder_in(metric: MetricResult) -> LoopFinder:
-    assert metric.kept is not None, "a refined map"
-    model, summary = metric.kept.model, metric.kept.summary
-    return LoopFinder(model, metric.trajectory.as_in(model), summary.covariance, summary.pixel_stddev)
+    refined = metric.kept
+    assert refined is not None, "a refined map"
+    path = metric.trajectory.as_in(refined.model)
+    return LoopFinder(refined.model, path, refined.covariance, refined.pixel_stddev)
 
 
 def _closed_by_photos(

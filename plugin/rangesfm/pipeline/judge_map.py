@@ -44,7 +44,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
         )
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
     doubts += doubts_of_points(point_errors(metric.final))
-    doubts += () if metric.kept is None else doubts_of_refinement(metric.kept.summary)
+    doubts += () if metric.kept is None else doubts_of_refinement(metric.kept)
     doubts += run.doubts
     # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
@@ -62,7 +62,7 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     if not metric.final.num_points3D():
         return ()
     is_learnt = any(each.shows_bending and each.is_used for each in metric.kinds)
-    factor = metric.kept.summary.bending_factor if metric.kept is not None and is_learnt else LARGEST_FACTOR
+    factor = metric.kept.bending_factor if metric.kept is not None and is_learnt else LARGEST_FACTOR
     return doubts_of_lens(metric.final, factor, metric.estimate.uncertainty.half_width_95)
 
 

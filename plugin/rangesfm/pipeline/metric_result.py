@@ -58,12 +58,12 @@ class ModelVerdict:
     reason: str
 
 
-@dataclass(frozen=True)
-class RefinedMap:
-    """A refined map.
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RefinedMap(RefineSummary):
+    """A refined map, with the summary of its refinement.
 
     Attributes:
-        model: the map. summary: of its refinement.
+        model: the map.
         kinds: the measurements of the refinement, with their noise at rest.
         on_map: all that is measured in the map at rest, before it is moved to its estimate; the map before the
             refinement, without kinds, where nothing is known of the scale's error.
@@ -73,7 +73,6 @@ class RefinedMap:
     """
 
     model: pycolmap.Reconstruction
-    summary: RefineSummary
     kinds: tuple[Measurements, ...]
     on_map: JointMap
     scale: float
@@ -139,7 +138,7 @@ class MetricResult:
     @property
     def ranges(self) -> ScaleEstimate | RefinedRanges:
         """Return the ranges as the final map has them."""
-        return self.estimate if self.kept is None else self.kept.summary.ranges
+        return self.estimate if self.kept is None else self.kept.ranges
 
     @property
     def anchors(self) -> tuple[AnchorEstimate, ...]:
@@ -175,7 +174,7 @@ class MetricResult:
     @property
     def map_errors(self) -> MapErrors:
         """Return how the parts of the refined map err together."""
-        return UNKNOWN_ERRORS if self.kept is None else self.kept.summary.covariance
+        return UNKNOWN_ERRORS if self.kept is None else self.kept.covariance
 
     @property
     def georeference(self) -> Georeference | None:
@@ -191,11 +190,8 @@ class MetricResult:
         moved = replace(estimate, metric_from_sfm=shift @ estimate.metric_from_sfm)
         if refined is not None:
             refined = replace(
-                refined,
+                refined.with_anchors(tuple(each.moved(shift) for each in refined.ranges.anchors)),
                 model=rescale(refined.model, shift),
-                summary=refined.summary.with_anchors(
-                    tuple(each.moved(shift) for each in refined.summary.ranges.anchors)
-                ),
                 loops=refined.loops and refined.loops.moved(offset_m),
             )
         return replace(

@@ -124,7 +124,10 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
     else:
         scale, (model, state) = on_map.scale.value, _at_estimate(on_map, rest, path)
         summary = replace(summary, ranges=refined_ranges(rest, state, covariance, on_map.estimate))
-    return replace(metric, refined=RefinedMap(model, summary, rest.problem.kinds, on_map, scale, broken))
+    refined = RefinedMap(
+        **vars(summary), model=model, kinds=rest.problem.kinds, on_map=on_map, scale=scale, why_broken=broken
+    )
+    return replace(metric, refined=refined)
 
 
 def _at_estimate(at_rest: JointMap, rest: MapAtRest, unscaled: Trajectory) -> tuple[pycolmap.Reconstruction, MapState]:
@@ -152,14 +155,14 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
     """
     if metric.kept is None:
         return metric
-    estimate, at, summary = start.estimate, metric.kept.on_map, metric.kept.summary
+    estimate, refined, at = start.estimate, metric.kept, metric.kept.on_map
     for sides in (sides for each in at.kinds for sides in each.sides(at)):
         estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
         if sides.has_crossed:
             again = refine_map(run, replace(start, estimate=estimate))
             return metric if again.kept is None else again
-        summary = summary.with_anchors(sides.moved(at.estimate).applied_to(summary.ranges.anchors))
-    return replace(metric, estimate=estimate, refined=replace(metric.kept, summary=summary))
+        refined = refined.with_anchors(sides.moved(at.estimate).applied_to(refined.ranges.anchors))
+    return replace(metric, estimate=estimate, refined=refined)
 
 
 def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:

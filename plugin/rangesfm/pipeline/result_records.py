@@ -162,22 +162,20 @@ def _loops(found: MetricResult) -> entries.LoopsEntry | None:
 def _refinement(found: MetricResult) -> entries.RefineEntry | None:
     if found.refined is None:
         return None
-    why_broken, summary = found.refined.why_broken, found.refined.summary
-    ranges = summary.ranges
+    refined, ranges = found.refined, found.refined.ranges
     others = {
-        "kept": not why_broken,
-        "why_not_kept": why_broken,
-        "iterations": summary.num_iterations,
-        "keyframe_graph_steps": summary.num_graph_steps,
+        "kept": not refined.why_broken,
+        "why_not_kept": refined.why_broken,
+        "iterations": refined.num_iterations,
+        "keyframe_graph_steps": refined.num_graph_steps,
         "correlation_inflation": ranges.errors.inflation,
-        "converged": summary.converged,
-        "scale_value": found.refined.scale,
-        "relative_scale_stddev": summary.covariance.scale_stddev,
+        "scale_value": refined.scale,
+        "relative_scale_stddev": refined.covariance.scale_stddev,
         "tag_in_cam_m": dict(zip(ranges.observations.log.tag_ids, ranges.tags_in_cam_m, strict=True)),
         "time_offset_change_s": ranges.time_shift_s,
         "short_range_error_m": ranges.short_range_error_m,
     }
-    return entries.RefineEntry.model_validate({**vars(summary), **others})
+    return entries.RefineEntry.model_validate({**vars(refined), **others})
 
 
 def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
@@ -347,7 +345,7 @@ def ranges_as_used(found: MetricResult) -> RangesAsUsed:
         keyframe_after=tuple(names[i] for i in observations.after),
         weight=np.where(observations.before >= 0, observations.fraction, np.nan),
         predicted_scaled_m=found.estimate.predicted_m,
-        predicted_refined_m=unknown if found.kept is None else found.kept.summary.ranges.predicted_m,
+        predicted_refined_m=unknown if found.kept is None else found.kept.ranges.predicted_m,
         residual_m=found.residuals_m,
         robust_weight=np.where(has_say, found.ranges.weights, np.nan),
         status=tuple(labels[status] for status in observations.status.tolist()),
