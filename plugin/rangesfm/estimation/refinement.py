@@ -78,11 +78,6 @@ class MapAtRest:
         """Return whether a block was free."""
         return block in self.state.blocks and not any(block in kind.fixed for kind in self.problem.kinds)
 
-    @property
-    def converged(self) -> bool:
-        """Return whether the keyframes came to rest."""
-        return self.run.converged and self.run.is_still
-
 
 def refine(problem: MapProblem, *, with_equations: bool = True) -> MapAtRest:
     """Refine a model in place, and return it at rest.

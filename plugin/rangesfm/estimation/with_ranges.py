@@ -24,6 +24,7 @@ from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bundle_adjustment import SolverRun
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
@@ -132,21 +133,15 @@ class RefinedRanges:
     short_range_error_m: float | None
 
 
-@dataclass(frozen=True)
-class RefineSummary:
-    """Result of the refinement.
+@dataclass(frozen=True, kw_only=True)
+class RefineSummary(SolverRun):
+    """Result of the refinement: the whole run of the solver on the full problem, and what it led to.
 
     Attributes:
-        num_iterations: of the solver on the full problem, successful and unsuccessful.
         num_graph_steps: of the solver on the keyframe graph before.
         bend_m: root mean square bending of the map in the keyframe graph, beyond any similarity.
-        initial_cost, final_cost: half the sum of squares, in pixels at unit weight: at the start with the weights at
-            that time, and at the end.
         reprojection_rms_px: root mean square length of the final reprojection errors.
         pixel_stddev: standard deviation of a feature's coordinate, from the residuals before.
-        seconds: time of the solver.
-        converged: whether the keyframes came to rest.
-        message: of the solver.
         misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
         ranges: as the refined map has them.
         covariance: how poses, cameras and anchors err together; not known if not asked for, if the model is too large,
@@ -154,16 +149,10 @@ class RefineSummary:
         bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
     """
 
-    num_iterations: int
     num_graph_steps: int
     bend_m: float
-    initial_cost: float
-    final_cost: float
     reprojection_rms_px: float
     pixel_stddev: float
-    seconds: float
-    converged: bool
-    message: str
     misfits: tuple[Doubt, ...]
     ranges: RefinedRanges
     covariance: MapErrors
@@ -186,16 +175,11 @@ def summarize(rest: MapAtRest, covariance: MapErrors, bending_factor: float) -> 
         rest: the map at rest. covariance, bending_factor: as in the summary.
     """
     return RefineSummary(
-        num_iterations=rest.run.num_iterations,
+        **vars(rest.run),
         num_graph_steps=rest.num_graph_steps,
         bend_m=rest.bend_m,
-        initial_cost=rest.run.initial_cost,
-        final_cost=rest.run.final_cost,
         reprojection_rms_px=rest.reprojection_rms_px,
         pixel_stddev=rest.pixel_stddev,
-        seconds=rest.run.seconds,
-        converged=rest.converged,
-        message=rest.run.message,
         misfits=ranges_of(rest.problem.measured).misfits(rest.state),
         ranges=refined_ranges(rest, rest.state, covariance),
         covariance=covariance,

@@ -54,9 +54,11 @@ class SolverRun:
     """Result of a run of the solver, or of several one after the other.
 
     Attributes:
-        num_iterations: successful and unsuccessful ones. initial_cost, final_cost: half the sum of squares, in pixels.
+        num_iterations: successful and unsuccessful ones.
+        initial_cost, final_cost: half the sum of squares, in pixels at unit weight: at the start with the weights at
+            that time, and at the end.
         seconds: time of the solver.
-        converged: whether it stopped by itself, at the end.
+        converged: whether it stopped by itself at the end, and of a whole refinement with the keyframes at rest.
         is_still: whether the keyframes came to rest in free steps.
         is_stuck: whether free steps still promise a decrease that matters, but none of them succeeds.
         message: of the solver.
@@ -241,7 +243,7 @@ def solve_until_still(problem: BundleAdjustment, before: SolverRun, tolerance_m:
         before: the run so far. num_left: largest number of further iterations.
 
     Returns:
-        the whole run; the keyframes are still only if that is at a minimum.
+        the whole run, which has converged if the keyframes came to rest at a minimum.
     """
     run, is_over, centers = before, before.is_still, keyframe_centers(problem.metric)
     while not is_over and num_left > 0:
@@ -252,7 +254,7 @@ def solve_until_still(problem: BundleAdjustment, before: SolverRun, tolerance_m:
         is_at_rest = farthest(last, centers) <= tolerance_m
         is_over = found.is_still or is_at_rest
         run = run.then(replace(found, is_still=is_over and (found.is_still or not found.is_stuck)))
-    return run
+    return replace(run, converged=run.converged and run.is_still)
 
 
 def _settle_radio(problem: BundleAdjustment) -> None:

@@ -95,7 +95,7 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
     problem = InertialProblem(log, path, MOUNTING, PRIOR, WalkBending(path))
     rest = refined(made.reconstruction, path, lambda at: motions_on_map(problem, state, intervals, covariance, at))
     assert rmse(drifted.centers - true.centers) > 0.1
-    assert rest.converged
+    assert rest.run.converged
     np.testing.assert_allclose(rest.state.poses.centers, true.centers, atol=1e-6)
     np.testing.assert_allclose(rest.state.poses.world_from_rig, true.world_from_rig, atol=1e-6)
 
