@@ -1,19 +1,16 @@
-"""Pairs of photos that are worth matching: the refined map predicts that they see the same part of the site."""
+"""Photos that see the same part of the site, as the refined map predicts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pycolmap
-from scipy.spatial import KDTree
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import ids_seen_in
-from rangesfm.sfm.loops.relative_errors import RelativeErrors
-from rangesfm.util.geometry.rotations import cross_matrices
 
 # Points of a photo that stand for all that it sees, evenly chosen from them.
 _NUM_POINTS = 40
@@ -69,7 +66,7 @@ class Views:
         """Return the row of each photo by its id."""
         return {id_: row for row, id_ in enumerate(self.image_ids.tolist())}
 
-    @property
+    @cached_property
     def targets(self) -> Array:
         """Return the (n, 3) middles of what the photos see."""
         return np.asarray(np.median(self.points, axis=1))
@@ -103,65 +100,7 @@ def _some_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array
     return np.array([model.point3D(point_id).xyz for point_id in chosen.tolist()])
 
 
-def propose_pairs(
-    views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]], *, max_num: int, pixel_stddev: float
-) -> dict[int, list[tuple[int, int]]]:
-    """Return for each photo, by its id, its pairs that tell most about the map, the best first, as ids, smaller first.
-
-    A pair tells what each of its features does: the logarithm of the error of the prediction over that of the feature.
-    Of photos that know each other only one is paired with the same photo, since they tell the same. Where the map is
-    already known to the precision of a feature, no pair is worth its time.
-
-    Args:
-        errors: of the keyframes of ``views``.
-        known: ids of the photos that each photo has been matched with or shares points with, by its id.
-        max_num: largest number of pairs of one photo.
-        pixel_stddev: standard deviation of a coordinate of a feature.
-    """
-    choices: dict[int, list[tuple[int, int]]] = {}
-    for first, others, overlap in predicted_overlaps(views, errors, known):
-        worth = overlap * np.log(np.maximum(_unknown_px(views, errors, first, others) / pixel_stddev, 1.0))
-        id_ = int(views.image_ids[first])
-        best = views.image_ids[_best_apart(others, worth, views.image_ids, known, max_num)].tolist()
-        choices[id_] = [(min(id_, other), max(id_, other)) for other in best]
-    return choices
-
-
-def predicted_overlaps(
-    views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]], *, from_anywhere: bool = False
-) -> Iterator[tuple[int, Indices, Array]]:
-    """Yield for each photo the others that the map predicts to see enough of its points, with their shares.
-
-    Args:
-        errors, known: as for ``propose_pairs``. from_anywhere: as for ``Views.overlaps``.
-
-    Yields:
-        The row of a photo in ``views``, the rows (k,) of the others, and the (k,) shares of its points in these.
-    """
-    tree, stddev_m = KDTree(views.targets), errors.stddev_m[views.frame]
-    reach_m = np.median(np.linalg.norm(views.points - views.centers[:, None], axis=2), axis=1) + 2 * stddev_m
-    for first, near in enumerate(tree.query_ball_point(views.targets, reach_m, return_sorted=True)):
-        knows = known.get(int(views.image_ids[first]), set())
-        others = np.array([k for k in near if k != first and int(views.image_ids[k]) not in knows], dtype=np.int64)
-        if not len(others):
-            continue
-        margin_m = np.hypot(stddev_m[first], stddev_m[others])
-        overlap = views.overlaps(first, others, margin_m, from_anywhere=from_anywhere)
-        yield first, others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
-
-
-def _unknown_px(views: Views, errors: RelativeErrors, first: int, others: Indices) -> Array:
-    """Return the (k,) standard deviations with which the map predicts, in k photos, the target of one photo."""
-    target = np.median(views.points[first], axis=0)
-    arm = target - errors.centers[views.frame[others]]
-    by_pose = np.concatenate([-cross_matrices(arm), np.tile(np.eye(3), (len(others), 1, 1))], axis=2)
-    variance = errors.variances(int(views.frame[first]), views.frame[others], by_pose)
-    distance = np.linalg.norm(target - views.centers[others], axis=1)
-    focal = views.focal_px[others].mean(axis=1)
-    return np.asarray(focal / distance * np.sqrt(variance / 3))
-
-
-def _best_apart(
+def best_apart(
     others: Indices, worth: Array, image_ids: Indices, known: Mapping[int, Set[int]], max_num: int
 ) -> list[int]:
     """Return the photos of largest worth, at most ``max_num`` and none that knows a better one of them."""

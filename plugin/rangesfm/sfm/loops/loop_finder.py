@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from scipy.linalg import block_diag
 from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
@@ -17,10 +18,9 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED, ids_seen_in, overlaps_in
 from rangesfm.estimation.vision_information import Loop
 from rangesfm.sfm.loop_database import Pair
-from rangesfm.sfm.loops.candidates import Views, predicted_overlaps, propose_pairs
-from rangesfm.sfm.loops.relative_errors import RelativeErrors
+from rangesfm.sfm.loops.candidates import MIN_OVERLAP, Views, best_apart
 from rangesfm.sfm.loops.resection import resect
-from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.map_errors import MapErrors, Part
 from rangesfm.util.geometry.rotations import cross_matrices
 from rangesfm.util.geometry.trajectory import Trajectory, pose_of
 
@@ -45,22 +45,27 @@ class LoopFinder:
     pixel_stddev: float
 
     @cached_property
-    def errors(self) -> RelativeErrors:
-        return RelativeErrors.of_keyframes(self.map_errors, self.path.frame_ids, self.path.centers)
-
-    @cached_property
     def views(self) -> Views:
         return Views.in_model(self.model, self.path.frame_ids)
 
     def propose(self, matched: Mapping[int, Set[int]], *, max_num: int) -> dict[int, list[Pair]]:
-        """Return for each photo, by its id, the pairs that are worth matching, the best first.
+        """Return for each photo, by its id, its pairs that tell most about the map, the best first.
+
+        A pair tells what each of its features does: the logarithm of the error of the prediction over that of the
+        feature. Of photos that know each other only one is paired with the same photo, since they tell the same. Where
+        the map is already known to the precision of a feature, no pair is worth its time.
 
         Args:
             matched: ids of the photos that each photo was matched with, by its id.
             max_num: largest number of pairs of one photo.
         """
-        known = self._known(matched)
-        return propose_pairs(self.views, self.errors, known, max_num=max_num, pixel_stddev=self.pixel_stddev)
+        known, ids = self._known(matched), self.views.image_ids
+        choices: dict[int, list[Pair]] = {}
+        for first, others, overlap in self._overlaps(known, from_anywhere=False):
+            worth = overlap * np.log(np.maximum(self._unknown_px(first, others) / self.pixel_stddev, 1.0))
+            id_, best = int(ids[first]), ids[best_apart(others, worth, ids, known, max_num)].tolist()
+            choices[id_] = [(min(id_, other), max(id_, other)) for other in best]
+        return choices
 
     def predicted(self, matched: Mapping[int, Set[int]]) -> dict[int, set[int]]:
         """Return for each photo those that it was matched with, or that the map predicts to see the same, by ids.
@@ -68,9 +73,46 @@ class LoopFinder:
         They may see it from where its features are not found again.
         """
         known, ids = self._known(matched), self.views.image_ids
-        for first, others, _ in predicted_overlaps(self.views, self.errors, known, from_anywhere=True):
+        for first, others, _ in self._overlaps(known, from_anywhere=True):
             known[int(ids[first])].update(ids[others].tolist())
         return known
+
+    def _overlaps(self, known: Mapping[int, Set[int]], *, from_anywhere: bool) -> Iterator[tuple[int, Indices, Array]]:
+        """Yield for each photo the others that the map predicts to see enough of its points, with their shares.
+
+        Args:
+            known: ids of the photos that each photo is not to be paired with, by its id.
+            from_anywhere: as for ``Views.overlaps``.
+
+        Yields:
+            The row of a photo in ``views``, the rows (k,) of the others, and the (k,) shares of its points in these.
+        """
+        views = self.views
+        centers_m2 = self.map_errors.centers_m2(self.path.frame_ids)
+        tree, stddev_m = KDTree(views.targets), np.sqrt(np.trace(centers_m2, axis1=1, axis2=2) / 3)[views.frame]
+        reach_m = np.median(np.linalg.norm(views.points - views.centers[:, None], axis=2), axis=1) + 2 * stddev_m
+        for first, near in enumerate(tree.query_ball_point(views.targets, reach_m, return_sorted=True)):
+            knows = known.get(int(views.image_ids[first]), set())
+            others = np.array([k for k in near if k != first and int(views.image_ids[k]) not in knows], dtype=np.int64)
+            if not len(others):
+                continue
+            margin_m = np.hypot(stddev_m[first], stddev_m[others])
+            overlap = views.overlaps(first, others, margin_m, from_anywhere=from_anywhere)
+            yield first, others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
+
+    def _unknown_px(self, first: int, others: Indices) -> Array:
+        """Return the (k,) standard deviations with which the map predicts, in k photos, the target of one photo."""
+        views, errors, target = self.views, self.map_errors.parts["frame"], self.views.targets[first]
+        frame = views.frame[np.append(first, others)]
+        rows = np.array([errors.row_of[frame_id] for frame_id in self.path.frame_ids[frame].tolist()])
+        by_pose = _by_pose(np.tile(np.eye(3), (len(rows), 1, 1)), target - self.path.centers[frame])
+        held, moved = rows[0], rows[1:]
+        by_held, by_moved = by_pose[0], by_pose[1:]
+        by_mode = by_moved @ errors.modes[moved] - by_held @ errors.modes[held]
+        rests = by_moved @ errors.rests[moved] * by_moved + by_held @ errors.rests[held] * by_held
+        variance = np.sum(by_mode**2, axis=(1, 2)) + np.sum(rests, axis=(1, 2))
+        distance = np.linalg.norm(target - views.centers[others], axis=1)
+        return np.asarray(views.focal_px[others].mean(axis=1) / distance * np.sqrt(variance / 3))
 
     def _known(self, matched: Mapping[int, Set[int]]) -> dict[int, set[int]]:
         """Return for each photo of the map those that it was matched with or shares enough points with, by ids."""
@@ -122,21 +164,24 @@ class LoopFinder:
         row, from_camera = self.views.row_of[photos[1]], points[fits] - _center(cam_from_world)
         by_point = _pixels_by_points(from_camera, world_from_cam[None], self.views.focal_px[row])
         residuals_px = np.asarray(camera.img_from_cam(from_camera @ world_from_cam)) - pixels[fits]
-        frames, by_frame, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, _center(after))
+        by_part, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, _center(after))
 
-        def covariance(frame: int, by_own: Array) -> Array:
+        def covariance(frame_id: int, by_own: Array) -> Array:
             """Return the (6, 6) covariance of the pose by the points against what depends on another keyframe."""
-            return noise + self.errors.covariance(np.append(frames, frame), np.concatenate([by_frame, by_own]))
+            part: Part = ("frame", frame_id)
+            return noise + self.map_errors.propagated({**by_part, part: by_part.get(part, 0.0) - by_own})
 
         held, moved = (int(self.views.frame[self.views.row_of[photo]]) for photo in photos)
-        difference = np.concatenate([Rotation.from_matrix(from_map).as_rotvec(), shift])
-        squared = difference @ np.linalg.solve(covariance(moved, -np.eye(6)[None]), difference)
-        chance = float(chdtrc(len(difference), float(squared)))
-        information = np.linalg.inv(covariance(held, -self.errors.carried(held, np.array([moved]))))
         reference, frame = self.path.frame_ids[[held, moved]].tolist()
+        difference = np.concatenate([Rotation.from_matrix(from_map).as_rotvec(), shift])
+        squared = difference @ np.linalg.solve(covariance(frame, np.eye(6)), difference)
+        chance = float(chdtrc(len(difference), float(squared)))
+        carried = np.eye(6)  # how the placed keyframe errs if it keeps its place relative to the other one
+        carried[3:] = _by_pose(np.eye(3)[None], (self.path.centers[moved] - self.path.centers[held])[None])[0]
+        information = np.linalg.inv(covariance(reference, carried))
         from_held, turned = pose_of(self.model.frame(reference)).rotation.matrix().T, after.rotation.matrix().T
         axes = block_diag(turned, from_held)
-        apart = self.errors.centers[moved] + shift - self.errors.centers[held]
+        apart = self.path.centers[moved] + shift - self.path.centers[held]
         loop = Loop(reference, frame, from_held.T @ turned, from_held.T @ apart, axes.T @ information @ axes)
         return loop, chance
 
@@ -157,7 +202,7 @@ class LoopFinder:
 
     def _dependence(
         self, ids: Indices, points: Array, by_point: Array, residuals_px: Array, center: Array
-    ) -> tuple[Indices, Array, Array]:
+    ) -> tuple[dict[Part, Array], Array]:
         """Return how the pose by k points errs.
 
         Args:
@@ -167,8 +212,8 @@ class LoopFinder:
             center: (3,) origin of the placed rig.
 
         Returns:
-            Keyframes (f,) on whose errors the pose depends, its derivatives (f, 6, 6) by these (turn about the axes of
-            the world, shift of the rig's origin), and its covariance (6, 6) that is due to the features alone.
+            Derivatives (6, 6) of the pose, a turn about the axes of the world and a shift of the rig's origin, by the
+            keyframes that see the points, and its covariance (6, 6) that is due to the features alone.
         """
         views, (known, first, view) = self.views, self._sightings
         place = np.searchsorted(known, ids)
@@ -180,7 +225,7 @@ class LoopFinder:
         information = np.add.reduceat(np.swapaxes(seen, 1, 2) @ seen, starts)
         inverse = np.linalg.pinv(information, hermitian=True)
         noise = self.pixel_stddev**2 * (np.eye(2) + by_point @ inverse @ np.swapaxes(by_point, 1, 2))
-        by_pose = _pixels_by_pose(by_point, points - center)
+        by_pose = -_by_pose(by_point, points - center)
         weights = np.linalg.inv(noise)
         weighted = np.swapaxes(by_pose, 1, 2) @ weights
         covariance = np.linalg.inv(np.sum(weighted @ by_pose, axis=0))
@@ -188,11 +233,12 @@ class LoopFinder:
         variance = max(float(squared) / (residuals_px.size - len(covariance)), 1.0)
         frame = views.frame[row]
         to_pose = (covariance @ weighted @ by_point @ inverse)[point] @ np.swapaxes(seen, 1, 2)
-        by_seen = to_pose @ _pixels_by_pose(seen, points[point] - self.errors.centers[frame])
+        by_seen = to_pose @ -_by_pose(seen, points[point] - self.path.centers[frame])
         frames, of_frame = np.unique(frame, return_inverse=True)
         adder = csr_array((np.ones(len(row)), (of_frame, np.arange(len(row)))), shape=(len(frames), len(row)))
         by_frame = (adder @ by_seen.reshape(-1, 36)).reshape(-1, 6, 6)
-        return frames, by_frame, variance * covariance
+        ids_of_frames = self.path.frame_ids[frames].tolist()
+        return {("frame", id_): by for id_, by in zip(ids_of_frames, by_frame, strict=True)}, variance * covariance
 
 
 def _center(rig_from_world: pycolmap.Rigid3d) -> Array:
@@ -209,6 +255,11 @@ def _pixels_by_points(from_camera: Array, world_from_cam: Array, focal_px: Array
     return np.asarray(slope @ np.swapaxes(world_from_cam, 1, 2))
 
 
-def _pixels_by_pose(by_point: Array, from_rig: Array) -> Array:
-    """Return the (n, 2, 6) derivatives of pixels by a turn of the rig about the axes of the world and its shift."""
-    return np.concatenate([by_point @ cross_matrices(from_rig), -by_point], axis=2)
+def _by_pose(by_point: Array, arm: Array) -> Array:
+    """Return the (n, d, 6) derivatives of what depends on points by a pose: a turn about the world's axes and a shift.
+
+    Args:
+        by_point: (n, d, 3) derivatives by points that keep their places relative to a rig.
+        arm: (n, 3) from the origin of the rig to each point.
+    """
+    return np.concatenate([-by_point @ cross_matrices(arm), by_point], axis=2)

@@ -111,20 +111,31 @@ class MapErrors:
         Returns:
             (3 k, 3 k) covariance of their coordinates.
         """
-        covariance: Array = block_diag(*(point.own_m2 for point in points))
-        num_modes = next(iter(self.parts.values())).modes.shape[2]
-        by_mode, by_scale = np.zeros((len(covariance), num_modes)), np.zeros(len(covariance))
+        by_part: dict[Part, Array] = {}
         for part in dict.fromkeys(part for point in points for part in point.by_part):
-            (kind, id_) = part
-            errors = self.parts[kind]
             num = next(point.by_part[part].shape[1] for point in points if part in point.by_part)
-            row, nothing = errors.row_of[id_], np.zeros((3, num))  # cameras of other models have more parameters
-            slope = np.vstack([point.by_part.get(part, nothing) for point in points])
-            by_mode += slope @ errors.modes[row, :num]
-            by_scale += slope @ errors.by_scale[row, :num]
-            covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
-        covariance = covariance + by_mode @ by_mode.T
+            nothing = np.zeros((3, num))  # cameras of other models have more parameters
+            by_part[part] = np.vstack([point.by_part.get(part, nothing) for point in points])
+        by_scale = np.zeros(3 * len(points))
+        for (kind, id_), slope in by_part.items():
+            errors = self.parts[kind]
+            by_scale += slope @ errors.by_scale[errors.row_of[id_], : slope.shape[1]]
+        covariance = block_diag(*(point.own_m2 for point in points)) + self.propagated(by_part)
         return np.asarray(covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale))
+
+    def propagated(self, by_part: Mapping[Part, Array]) -> Array:
+        """Return the (m, m) covariance of m numbers, given their (m, d) derivatives by each part on which they depend.
+
+        A part may have more than d numbers, of which the first are meant.
+        """
+        by_mode, of_rests = [], []
+        for (kind, id_), slope in by_part.items():
+            errors, num = self.parts[kind], slope.shape[1]
+            row = errors.row_of[id_]
+            by_mode.append(slope @ errors.modes[row, :num])
+            of_rests.append(slope @ errors.rests[row, :num, :num] @ slope.T)
+        modes = np.sum(by_mode, axis=0)
+        return np.asarray(modes @ modes.T + np.sum(of_rests, axis=0))
 
 
 UNKNOWN_ERRORS = MapErrors({}, np.nan)
