@@ -23,8 +23,6 @@ from rangesfm.options import RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.robust_statistics import RobustLoss
-from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory
 
 CLOCK: Block = ("clock", "ranges")
 SHORT: Block = ("short range error", "ranges")
@@ -283,26 +281,6 @@ class Ranges(Measurements):
 
     def log_likelihood(self, residual: Array) -> float:
         return self.errors.noise_of_estimated(residual[:, 0]).log_likelihood
-
-
-def antenna_places(
-    trajectory: Trajectory,
-    observations: RangeObservations,
-    metric_from_sfm: Similarity,
-    tag_in_cam_m: npt.ArrayLike,
-) -> tuple[AntennaPlaces, Array]:
-    """Return the places of the antennas of all n ranges on a metric map, and the (num_tags, 3) lever arms.
-
-    Args:
-        trajectory, observations: of the unscaled model. metric_from_sfm: from its world to that of the map.
-        tag_in_cam_m: (3,), or (num_tags, 3) in the order of the log's tags.
-    """
-    tags_in_cam_m, times = observations.log.lever_arms(tag_in_cam_m), trajectory.timestamps_s
-    before, after = observations.before, observations.after
-    interval_s = np.zeros(len(before)) if times is None else times[after] - times[before]
-    of_camera = AntennaPlaces(before, after, observations.fraction, interval_s, observations.center_offsets)
-    arms_in_cam_m, arms_m = tags_in_cam_m[observations.log.tag_index], observations.tag_from_center
-    return of_camera.on_map(trajectory, arms_in_cam_m, arms_m, metric_from_sfm), tags_in_cam_m
 
 
 def anchors_at(anchors: Sequence[AnchorEstimate], blocks: Mapping[Block, Array]) -> tuple[AnchorEstimate, ...]:

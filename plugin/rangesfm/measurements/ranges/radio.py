@@ -11,9 +11,10 @@ from rangesfm.arrays import Array
 from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths.cost import Lengths
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import MapToFit, NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.cost import Ranges, antenna_places
+from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
@@ -36,15 +37,18 @@ def ranges_of_map(
     options: RefineOptions,
 ) -> Ranges:
     """Return the ranges of a log on a metric map; arguments as for ``refine_with_ranges``."""
-    places, tags_in_cam_m = antenna_places(trajectory, observations, metric_from_sfm, tag_in_cam_m)
-    rows = observations.placed_rows
+    log, times_s = observations.log, trajectory.timestamps_s
+    before, after, tags_in_cam_m = observations.before, observations.after, log.lever_arms(tag_in_cam_m)
+    interval_s = np.zeros(len(log)) if times_s is None else times_s[after] - times_s[before]
+    of_camera = AntennaPlaces(before, after, observations.fraction, interval_s, observations.center_offsets)
+    arms_in_cam_m, arms_m = tags_in_cam_m[log.tag_index], observations.tag_from_center
     return Ranges(
         observations,
-        places,
+        of_camera.on_map(trajectory, arms_in_cam_m, arms_m, metric_from_sfm),
         tags_in_cam_m,
         tuple(anchors),
-        errors.subset(rows),
-        np.zeros((len(observations.log), 0)),
+        errors.subset(observations.placed_rows),
+        np.zeros((len(log), 0)),
         options,
         metric_from_sfm.scale,
     )

@@ -144,9 +144,11 @@ def _statistic(cause: Cause) -> float:
 def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Yield faults that are no mistake of one size: noise and lasting errors of all ranges, faults of each anchor."""
     far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
+    lasting_m2 = problem.noise.covariances_m2[np.isin(problem.noise.names, _LASTING)].sum(axis=0)
+    lasting_m = float(np.sqrt(np.trace(lasting_m2) / len(problem.bins)))  # root mean square over the bins
     for kind, what, stddev_m, most_m in (
         ("range noise", "scatter by {:.2f} m from one to the next", problem.scatter_m, _MOST_ERROR_M + far),
-        ("lasting errors", "have errors of {:.2f} m that last for seconds", _lasting_m(problem), _MOST_ERROR_M + far),
+        ("lasting errors", "have errors of {:.2f} m that last for seconds", lasting_m, _MOST_ERROR_M + far),
     ):
         words = f"the ranges {what.format(stddev_m)}; radios with a clear line of sight stay below {most_m:.2f} m"
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
@@ -181,13 +183,6 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
     words = f"{100 * fitting.max():.0f} % of the outliers among the ranges to anchor {name} fit anchor {other} instead"
     remedy = f"check whether two devices have the id {name}, or leave that anchor out (use_anchors)"
     return _seen(_MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
-
-
-def _lasting_m(problem: Linearized) -> float:
-    """Return the root mean square of the lasting errors over the bins, metres."""
-    lasting = np.isin(problem.noise.names, _LASTING)
-    variances = np.trace(problem.noise.covariances_m2[lasting].sum(axis=0))
-    return float(np.sqrt(variances / len(problem.bins)))
 
 
 def _seen(

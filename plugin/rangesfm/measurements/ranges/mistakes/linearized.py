@@ -170,8 +170,9 @@ def linearized(on_map: RangesOnMap) -> Linearized:
 
 def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
     alone_m2 = scatter_m**2 / np.maximum(bins.worth, 1e-12)
-    observed = in_bins(on_map, bins, scatter_m, {WANDERING: _wandering_m2(bins)}, alone_m2)
-    problem = joined([observed], on_map.bending)
+    together = np.exp(-np.abs(bins.time_s[:, None] - bins.time_s) / DRIFT_S)
+    wandering_m2 = _WANDERING_M**2 * (1.0 + (bins.anchor_index[:, None] == bins.anchor_index)) * together
+    problem = joined([in_bins(on_map, bins, scatter_m, {WANDERING: wandering_m2}, alone_m2)], on_map.bending)
     return Linearized(**vars(problem), on_map=on_map, bins=bins, scatter_m=scatter_m).with_usual_errors()
 
 
@@ -183,11 +184,6 @@ def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> boo
     """
     moved_m = now.from_anchor_m - before.from_anchor_m
     return bool(np.sqrt(np.mean(moved_m**2)) < NEGLIGIBLE_STDDEVS * scatter_m)
-
-
-def _wandering_m2(bins: RangeBins) -> Array:
-    together = np.exp(-np.abs(bins.time_s[:, None] - bins.time_s) / DRIFT_S)
-    return np.asarray(_WANDERING_M**2 * (1.0 + (bins.anchor_index[:, None] == bins.anchor_index)) * together)
 
 
 def _can_be(on_map: RangesOnMap) -> Mask:

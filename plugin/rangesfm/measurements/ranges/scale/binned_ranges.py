@@ -90,7 +90,7 @@ def moved(on_map: RangesOnMap, known: Posterior) -> RangesOnMap:
 
 
 def shared_errors_m(on_map: RangesOnMap, noise: Noise, bins: RangeBins) -> Array:
-    """Return the errors (n, k) that the n ranges of a solution share, for k independent standard deviations.
+    """Return the errors (n, k) that all n ranges of the log share, for k independent standard deviations.
 
     They are the principal axes of the learnt errors, in units of what a bin's ranges scatter by themselves; axes along
     which the errors are smaller than that are noise to the bins anyway.
@@ -104,4 +104,6 @@ def shared_errors_m(on_map: RangesOnMap, noise: Noise, bins: RangeBins) -> Array
     variances, axes = np.linalg.eigh(covariance_m2 / np.outer(scatter_m, scatter_m))
     matters = variances > 1
     of_bins = scatter_m[:, None] * axes[:, matters] * np.sqrt(variances[matters])
-    return np.asarray(of_bins[bins.of_range])
+    of_log = np.zeros((len(on_map.posed.observations.log), of_bins.shape[1]))
+    of_log[on_map.posed.rows] = of_bins[bins.of_range]
+    return of_log

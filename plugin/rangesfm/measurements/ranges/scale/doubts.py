@@ -6,15 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.ranges.anchors.anchor import Anchor, AnchorEstimate
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN
 from rangesfm.solver.bending import BENDS
 from rangesfm.solver.posterior import ScaleUncertainty
-from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95, NOTHING_KNOWN
 from rangesfm.util.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 
@@ -31,13 +29,7 @@ def doubts_of_ranges(
     on_map: RangesOnMap, uncertainty: ScaleUncertainty, per_anchor: Mapping[str, float]
 ) -> Iterator[Doubt]:
     """Yield the faults of the path, of the anchors and of the ranges; ``per_anchor``: scales, by anchor id."""
-    yield from _doubts_of_survey(on_map, uncertainty)
-    yield from _doubts_of_fit(on_map.weights, per_anchor)
-
-
-def _doubts_of_survey(on_map: RangesOnMap, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
-    """Return the faults of the path and of the anchors."""
-    problem, half_width = on_map.problem, uncertainty.half_width_95
+    problem, weights, half_width = on_map.problem, on_map.weights, uncertainty.half_width_95
     kind = path_kind(problem.centers)
     is_round = kind in ("circular", "spherical") and not problem.has_known_anchors
     # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
@@ -60,9 +52,6 @@ def _doubts_of_survey(on_map: RangesOnMap, uncertainty: ScaleUncertainty) -> Ite
             yield Doubt("the path is nearly straight: an unknown anchor may stand anywhere on a circle around it")
         elif problem.frame_is_free:
             yield Doubt("the path is nearly straight: the map's roll about it is uncertain")
-
-
-def _doubts_of_fit(weights: Array, per_anchor: Mapping[str, float]) -> Iterator[Doubt]:
     if len(weights) < FEW_RANGES:
         reason = f"only {len(weights)} ranges lie on the path"
         yield Doubt(reason, "range more often, and all along the path")
@@ -102,13 +91,16 @@ def remarks_on_places(uncertainty: ScaleUncertainty, with_unknown_anchors: Scale
     )
 
 
-def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
-    """Describe in words where gravity puts the first camera if the site's anchors do not fix the map's heading.
+def levelled_places(on_map: RangesOnMap, found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
+    """Describe where gravity puts the first camera if the site's anchors do not fix the map's heading, in words.
 
     Args:
-        surveyed: anchors in the site frame. found: anchors in the first camera's frame.
+        found: anchors in the first camera's frame.
     """
-    height_of = {anchor.anchor_id: anchor.position_m[2] for anchor in surveyed if anchor.position_m is not None}
+    given, gravity = on_map.posed.given, on_map.posed.given.gravity
+    if gravity is None or given.anchor_frame != "site" or on_map.problem.frame_is_free:
+        return ()
+    height_of = {anchor.anchor_id: anchor.position_m[2] for anchor in given.anchors if anchor.position_m is not None}
     texts = []
     for anchor in found:
         if anchor.anchor_id not in height_of or not np.isfinite(anchor.position_m).all():

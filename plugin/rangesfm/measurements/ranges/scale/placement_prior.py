@@ -24,11 +24,6 @@ class PlacementPrior:
     mean: Similarity
     whitening: Array
 
-    @classmethod
-    def with_covariance(cls, mean: Similarity, covariance: Array) -> PlacementPrior:
-        """Return the prior with this (7, 7) covariance."""
-        return cls(mean, np.linalg.inv(np.linalg.cholesky(covariance)))
-
     def _turn(self, similarity: Similarity) -> Array:
         return np.asarray(Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T).as_rotvec())
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_kinds
 from rangesfm.measurements.kind import Block, Doubt
-from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
 from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m, bent_to_ranges, drifts, likelier_sides
@@ -137,6 +136,7 @@ class RangeScale(KindOnMap):
             stddevs = noise.stddev_of_component
             return replace(self, told=replace(told, noise_stddev_m=solved.noise_stddev_m, error_stddevs=stddevs))
         known, after = on_map.posterior, moved(solved, on_map.posterior)
+        has_others = any(each.is_used for each in on_map.kinds if each.kind != self.kind)
         status = posed.observations.status.copy()
         status[posed.observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
         status[posed.rows] = status_by_weight(solved.weights)
@@ -150,21 +150,9 @@ class RangeScale(KindOnMap):
             scale_per_anchor(solved),
             scale_sensitivity(after, on_map.problem.of_kind(RANGES, known.gains), bins),
             _paper_table(solved),
-            np.zeros((len(log), 0)),
+            shared_errors_m(solved, noise, bins) if has_others else np.zeros((len(log), 0)),
         )
-        if any(each.is_used for each in on_map.kinds if each.kind != self.kind):
-            of_rows = shared_errors_m(solved, noise, bins)
-            shared_m = np.zeros((len(log), of_rows.shape[1]))
-            shared_m[posed.rows] = of_rows
-            found = replace(found, shared_errors_m=shared_m)
-        return replace(self, told=found, notes=(*self.notes, *self._levelled(found.anchors)))
-
-    def _levelled(self, found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
-        """Describe where gravity puts the first camera if the site's anchors do not fix the map's heading."""
-        given = self.solved.posed.given
-        if given.gravity is None or given.anchor_frame != "site" or self.places_map:
-            return ()
-        return levelled_places(given.gravity, given.anchors, found)
+        return replace(self, told=found, notes=(*self.notes, *levelled_places(solved, found.anchors)))
 
     def of_log(self, before: RangeEstimate) -> RangeEstimate:
         """Return what is said of the ranges."""

@@ -147,7 +147,8 @@ def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarit
         if each.places_map and each.is_used:
             known = each.alone.posterior
             best = moved_similarity(each.alone.placed, known.columns.map_step(known.step), each.alone.path)
-            return PlacementPrior.with_covariance(best @ first_camera_from_model.inverse(), known.place)
+            whitening = np.linalg.inv(np.linalg.cholesky(known.place))
+            return PlacementPrior(best @ first_camera_from_model.inverse(), whitening)
     return None
 
 

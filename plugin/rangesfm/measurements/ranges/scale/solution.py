@@ -82,7 +82,10 @@ def solve_scale(posed: ScaleProblem) -> RangesOnMap:
     camera_side = posed.given.camera_side if problem.frame_is_free else None
     starts = on_side(problem, [fit.state for fit in _distinct_fits(problem, posed.given.seed)], camera_side)
     if problem.has_known_anchors and not problem.frame_is_free:
-        starts += _consensus_states(problem)
+        # States with the highest consensus, not refined: a fit from there may be drawn away by outliers.
+        agreed = first_camera_starts(_known_only(problem))[:_NUM_ALTERNATIVES]
+        is_complete = not np.isinf(problem.anchor_stddev_m).any()
+        starts += agreed if is_complete else [complete_unknown_anchors(problem, start) for start in agreed]
     starts.sort(key=lambda state: _unlikeliness(problem, errors, state))
     likeliest = each_once(starts, lambda *both: _are_same(problem, *both), _NUM_ALTERNATIVES)
     best, *others = sorted(
@@ -99,14 +102,6 @@ def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState)
     """Return the negative logarithm of the posterior, up to a constant."""
     residuals = predicted_ranges(problem, state) - problem.range_m
     return prior_cost(problem, state) - errors.noise_of_all(residuals).log_likelihood
-
-
-def _consensus_states(problem: RangeProblem) -> list[RangeState]:
-    """Return the states with the highest consensus, not refined: a fit from there may be drawn away by outliers."""
-    starts = first_camera_starts(_known_only(problem))[:_NUM_ALTERNATIVES]
-    if np.isinf(problem.anchor_stddev_m).any():
-        return [complete_unknown_anchors(problem, start) for start in starts]
-    return starts
 
 
 def _distinct_fits(problem: RangeProblem, seed: int) -> list[RangeFit]:
