@@ -25,7 +25,7 @@ from rangesfm.planning.plan_checks import oddities, require_possible
 from rangesfm.planning.planned import Coordinate, Place, PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.planning.planned_sensor import PlannedSensor
-from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
+from rangesfm.survey.survey_reader import parse_toml, refuse_unknown_tables, with_absolute_paths
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -165,7 +165,7 @@ def read_plan(path: AnyPath) -> PlannedSurvey:
     with source.naming_lines():
         refuse_unknown_tables(tables, PLAN_TABLES)
         options: dict[str, Any] = {
-            name: model(**_absolute(tables.get(name, {}), model, folder))
+            name: model(**with_absolute_paths(tables.get(name, {}), model, folder))
             for name, model in PLAN_TABLES.items()
             if name not in _OPTIONAL_TABLES or name in tables
         }
@@ -196,15 +196,6 @@ def _checked(
     floors_m = [planned.walls_m[-1]] if path.loop_inside_m else []
     require_possible(planned, floors_m, path_key, anchor_key, point_key)
     return list(oddities(planned, [np.array(wall) for wall in anchors.walls_m], path_key, anchor_key))
-
-
-def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
-    """Return a table with absolute paths."""
-    keys = model.keys()
-    return {
-        name: absolute_value(value, folder) if name in keys and keys[name].role else value
-        for name, value in table.items()
-    }
 
 
 def _planned(

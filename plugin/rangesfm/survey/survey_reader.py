@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
 from rangesfm.measurements.ranges.readers import files_of_log
-from rangesfm.option_model import PathRole
+from rangesfm.option_model import Options, PathRole
 from rangesfm.options import CameraOptions
 from rangesfm.survey.settings import ROLE_OF_PATH, SURVEY_TABLES, OptionsOrigin, Survey
 from rangesfm.util.files.atomic import path_of
@@ -92,16 +92,14 @@ def survey_from_tables(
     with source.naming_lines():
         tables, other_cameras = _with_one_camera(tables)
         refuse_unknown_tables(tables, SURVEY_TABLES)
-        given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in SURVEY_TABLES}
-        given["output"].setdefault("path", "out")
-        for dotted_key in ROLE_OF_PATH:
-            table, _, name = dotted_key.partition(".")
-            if name in given[table]:
-                given[table][name] = absolute_value(given[table][name], folder)
+        tables = {**tables, "output": {"path": "out", **tables.get("output", {})}}
+        given = {
+            name: with_absolute_paths(tables.get(name, {}), model, folder) for name, model in SURVEY_TABLES.items()
+        }
         for dotted_key, value in overrides.items():
             table, _, name = dotted_key.partition(".")
             given[table].pop(_INSTEAD_OF.get(dotted_key), None)
-            given[table][name] = absolute_value(value, Path.cwd()) if dotted_key in ROLE_OF_PATH else value
+            given[table][name] = _absolute_value(value, Path.cwd()) if dotted_key in ROLE_OF_PATH else value
         given["camera"] |= {"others": other_cameras} if other_cameras else {}
         options: dict[str, Any] = {name: model(**given[name]) for name, model in SURVEY_TABLES.items()}
         survey = Survey(**options, source=source)
@@ -150,7 +148,16 @@ def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> 
             raise OptionError(f"{name} is {shown(table)}, expected a table [{name}]", "", name)
 
 
-def absolute_value(value: object, folder: Path) -> object:
+def with_absolute_paths(table: Mapping[Any, Any], model: type[Options], folder: Path) -> dict[Any, Any]:
+    """Return a table of a file in a folder with the paths in it absolute."""
+    keys = model.keys()
+    return {
+        name: _absolute_value(value, folder) if name in keys and keys[name].role else value
+        for name, value in table.items()
+    }
+
+
+def _absolute_value(value: object, folder: Path) -> object:
     """Return text or a path as an absolute path, and any other value unchanged."""
     # What can be the name of no file stays as it is, and is refused as no path.
     is_name = isinstance(value, (str, Path)) and str(value) and "\0" not in str(value)

@@ -119,7 +119,10 @@ def is_imu_log(path: Path) -> bool:
                 return bool(connections_of(bag, _MESSAGES))
         if path.is_dir():
             # A file with both is a log of its own.
-            parts = [{*_kinds(file)} for file in path.glob("*.csv")]
+            parts = [
+                {triple.kind or kind_of_file(file.stem) for triple in find_triples(_names(file))}
+                for file in path.glob("*.csv")
+            ]
             return {GYRO, ACCEL} <= {kind for part in parts if not {GYRO, ACCEL} <= part for kind in part}
         if _is_zip(path):
             with zipfile.ZipFile(path) as archive:
@@ -128,10 +131,6 @@ def is_imu_log(path: Path) -> bool:
         return {GYRO, ACCEL} <= {triple.kind for triple in find_triples(_names(path))}
     except (InputError, OSError, ValueError, zipfile.BadZipFile):
         return False
-
-
-def _kinds(path: Path) -> Iterator[str | None]:
-    yield from (triple.kind or kind_of_file(path.stem) for triple in find_triples(_names(path)))
 
 
 def _names(path: Path) -> list[str]:
@@ -320,7 +319,7 @@ def _chosen_gyro(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _S
     candidates = sorted((one for one in signals if one.kind == GYRO), key=lambda one: one.rank)
     if not candidates:
         raise InputError(f"there is no gyroscope in it, {_EXPECTED}", path)
-    gyro = _rising(_finite(candidates[0]), notes)
+    gyro = _rising(candidates[0], notes)
     # Faster turns than sensors measure are degrees, whatever the name of the column says.
     too_fast = bool(np.abs(gyro.values).max(initial=0.0) > _FASTEST_RAD_S)
     if gyro.unit != "deg" and too_fast:
@@ -349,14 +348,14 @@ def _chosen_accel(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _
                 )
             elif not one.unit and unit == "g":
                 notes.append(f"{one.path.name}: {one.name} are taken as g, by their length")
-            return _in_metres(_rising(_finite(one), notes), unit)
+            return _in_metres(_rising(one, notes), unit)
     if (gravity := next((one for one in signals if one.kind == GRAVITY), None)) is not None:
         unit_of_gravity = _unit_of_accel(gravity)
         if unit_of_gravity is not None:
             # On a phone both have the same unit, that of its operating system.
-            rest = _rising(_finite(replace(candidates[0], unit=candidates[0].unit or unit_of_gravity)), notes)
+            rest = _rising((replace(candidates[0], unit=candidates[0].unit or unit_of_gravity)), notes)
             rest = _in_metres(rest, rest.unit)
-            gravity = _in_metres(_rising(_finite(gravity), notes), unit_of_gravity)
+            gravity = _in_metres(_rising(gravity, notes), unit_of_gravity)
             notes.append(f"{rest.path.name}: acceleration without gravity, to which gravity is added")
             return replace(rest, values=rest.values + _at(gravity, rest.times_s))
     length = _length(candidates[0])
@@ -389,11 +388,14 @@ def _in_metres(signal: _Signal, unit: str) -> _Signal:
 
 
 def _rising(signal: _Signal, notes: list[str]) -> _Signal:
-    """Return a signal with times that rise; a few samples that are late or repeated are put in order or left out.
+    """Return a signal without missing values, with times that rise.
+
+    A few samples that are late or repeated are put in order or left out.
 
     Raises:
         InputError: the times go back.
     """
+    signal = _finite(signal)
     steps = np.diff(signal.times_s)
     usual_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
     back = np.flatnonzero(steps < -10 * usual_s)
@@ -425,7 +427,8 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
         InputError: too few samples are left, or they are too far apart.
     """
     for signal in (gyro, accel):
-        _require_samples(signal, path)
+        if (num := len(signal.times_s)) < _MIN_NUM:
+            raise InputError(f"{num} samples of the {signal.kind}, expected {_MIN_NUM} or more", path)
     gyro, accel = (_as_sampled(signal, notes) for signal in (gyro, accel))
     longest_s = max(0.1, 3 * float(np.median(np.diff(accel.times_s))))
     after = np.clip(np.searchsorted(accel.times_s, gyro.times_s), 1, len(accel.times_s) - 1)
@@ -456,11 +459,6 @@ def _as_sampled(signal: _Signal, notes: list[str]) -> _Signal:
     )
     notes += [] if note in notes else [note]
     return replace(signal, times_s=taken_s)
-
-
-def _require_samples(signal: _Signal, path: Path) -> None:
-    if len(signal.times_s) < _MIN_NUM:
-        raise InputError(f"{len(signal.times_s)} samples of the {signal.kind}, expected {_MIN_NUM} or more", path)
 
 
 def _doubts(log: ImuLog, gyro: _Signal, accel: _Signal) -> Iterator[str]:

@@ -8,11 +8,23 @@ from pathlib import Path
 
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
+from rangesfm.measurements.ranges.readers.guess import columns_by_name
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout
 from rangesfm.measurements.ranges.readers.lists import TableForm
 
 _Found = Mapping[str, Sequence[ColumnSample]]
 """Columns that may hold each quantity."""
+_BESIDE_LENGTH = terms.LENGTH_UNIT | terms.PLAIN
+_IN_LENGTHS = {
+    "distance": (terms.LENGTH, _BESIDE_LENGTH),
+    "stddev": (terms.STDDEV, terms.LENGTH | _BESIDE_LENGTH),
+    "kind": (terms.KIND, _BESIDE_LENGTH),
+}
+_IN_MARKS = {
+    "image_name": terms.NAMING_PHOTOS,
+    "marker": (terms.POINT | terms.MARK | terms.ID, frozenset[str]()),
+    **{axis: (words, terms.PIXEL) for axis, words in terms.PIXEL_AXES.items()},
+}
 
 
 def _only_columns(
@@ -57,18 +69,8 @@ def _ends(columns: Sequence[ColumnSample]) -> tuple[list[ColumnSample], list[Col
 
 
 def _lengths_by_name(layout: Layout) -> _Found | None:
-    of: dict[str, list[ColumnSample]] = {"distance": [], "stddev": [], "kind": []}
-    others = []
-    for column in layout.columns:
-        words = {*column.words} - terms.LENGTH_UNIT - terms.PLAIN
-        if words and words <= terms.LENGTH:
-            of["distance"].append(column)
-        elif words & terms.STDDEV and words <= terms.STDDEV | terms.LENGTH:
-            of["stddev"].append(column)
-        elif words and words <= terms.KIND:
-            of["kind"].append(column)
-        else:
-            others.append(column)
+    of = columns_by_name(layout.columns, _IN_LENGTHS)
+    others = of.pop("")
     if not of["distance"]:  # a column that is called cm
         of["distance"] = [column for column in others if column.words and {*column.words} <= terms.LENGTH_UNIT]
         others = [column for column in others if column not in of["distance"]]
@@ -86,18 +88,11 @@ def _lengths_by_value(layout: Layout) -> _Found | None:
 
 
 def _marks_by_name(layout: Layout) -> _Found | None:
-    of: dict[str, list[ColumnSample]] = {"marker": [], "image_name": [], "x": [], "y": []}
-    for column in layout.columns:
-        words = {*column.words}
-        if column.names_photos or (words & terms.PHOTO and words <= terms.PHOTO | terms.FILE | terms.ID):
-            of["image_name"].append(column)
-        elif words and words <= terms.POINT | terms.MARK | terms.ID:
-            of["marker"].append(column)
-        elif axis := next((a for a, those in terms.PIXEL_AXES.items() if set() < words - terms.PIXEL <= those), None):
-            of[axis].append(column)
-        elif words & terms.COORDINATES["z"]:
-            return None  # a list of points in space
-    return of
+    photos = [column for column in layout.columns if column.names_photos]
+    of = columns_by_name((column for column in layout.columns if column not in photos), _IN_MARKS)
+    if any({*column.words} & terms.COORDINATES["z"] for column in of.pop("")):
+        return None  # a list of points in space
+    return {**of, "image_name": [column for column in layout.columns if column in (*photos, *of["image_name"])]}
 
 
 def _marks_by_value(layout: Layout) -> _Found | None:

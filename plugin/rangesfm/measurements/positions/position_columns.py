@@ -15,7 +15,7 @@ import numpy as np
 from rangesfm.measurements.ranges.anchors.anchor_file import LOCAL_M
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising, named_photos
+from rangesfm.measurements.ranges.readers.guess import Guess, columns_by_name, find_time, is_rising, named_photos
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, are_quaternions
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
@@ -29,6 +29,10 @@ STDDEVS = tuple(f"stddev_{axis}" for axis in AXES)
 COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
+_AXES_BY_NAME = {
+    axis: (terms.COORDINATES[axis] | terms.DEGREES.get(axis, frozenset()), terms.BESIDE_COORDINATE | terms.TAG)
+    for axis in AXES
+}
 
 
 def find_position_columns(form: TableForm, path: Path, layout: Layout) -> dict[str, str]:
@@ -91,8 +95,8 @@ def _labels(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
 def _axes_by_name(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
     """Find x, y, z by their names; else return the columns that they may be, by the case in which they are."""
     numbers = [column for column in free if column.kind == "numbers"]
-    may_be = {axis: [column for column in numbers if _is_axis(column, axis)] for axis in AXES}
-    of_axis = {axis: [column.name for column in coordinates_of_point(those)] for axis, those in may_be.items()}
+    may_be = columns_by_name(numbers, _AXES_BY_NAME)
+    of_axis = {axis: [column.name for column in coordinates_of_point(may_be[axis])] for axis in AXES}
     groups = [*_triples(numbers)]
     if all(len(those) == 1 for those in of_axis.values()):
         found.columns |= {axis: those[0] for axis, those in of_axis.items()}
@@ -106,12 +110,6 @@ def _axes_by_name(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[
                 found.doubts.append(f"{'no column seems' if not those else 'several columns seem'} to be {axis}")
         return {f"{', '.join(group.values())} are x, y, z": group for group in groups}
     return {}
-
-
-def _is_axis(column: ColumnSample, axis: str) -> bool:
-    words = {*column.words} - terms.BESIDE_COORDINATE - terms.TAG
-    names = terms.COORDINATES[axis] | terms.DEGREES.get(axis, frozenset())
-    return bool(words) and words <= names
 
 
 def _triples(columns: Sequence[ColumnSample]) -> Iterator[dict[str, str]]:

@@ -194,7 +194,8 @@ def read_table(
             few or too many cells.
     """
     path = Path(path)
-    header_row, header_line, body = _split_header(read_text(path))
+    rows = ((line, row) for line, row in enumerate(read_text(path).split("\n"), 1) if _has_content(row))
+    header_line, header_row = next(rows, (0, ""))
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
     separator = separator or guess_separator(header_row)
@@ -209,8 +210,8 @@ def read_table(
     wanted = {name: names.index(name) for name in known if name in names}
     lines: list[int] = []
     columns: dict[str, list[str]] = {name: [] for name in wanted}
-    for line, row in enumerate(body.split("\n"), header_line + 1):
-        if not _has_content(row) or row == header_row:  # in joined files the header row is repeated
+    for line, row in rows:
+        if row == header_row:  # in joined files the header row is repeated
             continue
         cells = _split_row(row, separator, path, line)
         if len(cells) != len(names):
@@ -392,18 +393,6 @@ def _is_windows_text(data: bytes) -> bool:
 
 def _has_content(line: str) -> bool:
     return line.lstrip()[:1] not in "#"  # the empty string is in every string
-
-
-def _split_header(text: str) -> tuple[str, int, str]:
-    """Return the first row with content (empty if there is none), its 1-based line, and all text after it."""
-    start, line = 0, 1
-    while start < len(text):
-        end = text.find("\n", start)
-        end = len(text) if end < 0 else end
-        if _has_content(text[start:end]):
-            return text[start:end], line, text[end + 1 :]
-        start, line = end + 1, line + 1
-    return "", line, ""
 
 
 def _split_row(row: str, separator: str, path: Path, line: int) -> list[str]:

@@ -15,7 +15,6 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.measurements.ranges.anchors.anchor_file import (
     ANCHORS,
-    _named_quantity,
     find_points,
     read_anchor_list,
     read_anchors,
@@ -59,8 +58,9 @@ def test_optional_columns_are_read(tmp_path: Path) -> None:
     ("words", "quantity"),
     [("sigma", "position_stddev"), ("bias", "range_bias"), ("bias sigma", "range_bias_stddev")],
 )
-def test_a_stddev_is_that_of_the_position_unless_its_name_says_bias(words: str, quantity: str) -> None:
-    assert _named_quantity({*words.split()}) == quantity
+def test_a_stddev_is_that_of_the_position_unless_its_name_says_bias(tmp_path: Path, words: str, quantity: str) -> None:
+    columns = known(columns_of(table(tmp_path, f"Point,X,Y,Z,{words}/A,1,2,3,0.1/B,4,5,6,0.2")))
+    assert columns[quantity] == words
 
 
 def test_empty_coordinates_are_those_of_an_unknown_anchor(tmp_path: Path) -> None:

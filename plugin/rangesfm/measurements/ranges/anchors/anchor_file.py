@@ -12,7 +12,13 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
+from rangesfm.measurements.ranges.readers.guess import (
+    MAX_NUM_IDS,
+    by_id_rather_than_index,
+    columns_by_name,
+    is_named_time,
+    is_range,
+)
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.lists import (
     AXES,
@@ -27,9 +33,18 @@ from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable, repeated, write_user_table
 
-QUANTITIES = ("anchor_id", "x", "y", "z", "position_stddev", "range_bias", "range_bias_stddev")
 _GEOGRAPHIC = "EPSG:4979"
 _MAX_NUM_WAYS = 6  # ways to read a list that are offered
+_BESIDE = terms.LINKING | terms.BESIDE_COORDINATE | terms.RANGE
+# Words in the names of columns by quantity, and those beside them.
+_IN_POINTS = {
+    "anchor_id": (terms.ANCHOR | terms.ID | terms.POINT, terms.LINKING),
+    **{axis: (terms.COORDINATES[axis], _BESIDE | terms.ANCHOR | terms.POINT) for axis in AXES},
+    "position_stddev": (terms.STDDEV, _BESIDE),
+    "range_bias": (terms.BIAS, _BESIDE),
+    "range_bias_stddev": (terms.STDDEV | terms.BIAS, _BESIDE),
+}
+QUANTITIES = tuple(_IN_POINTS)
 # Coordinates beyond this, metres, are not local but those of a surveyed grid.
 LOCAL_M = 500.0
 
@@ -188,33 +203,16 @@ def _listed(columns: Sequence[ColumnSample]) -> str:
 
 def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
     """Return the columns that may hold each quantity by their names; an id also by its place and its cells."""
-    found: dict[str, list[ColumnSample]] = {quantity: [] for quantity in QUANTITIES}
-    others = list[ColumnSample]()
-    for column in layout.columns:
-        quantity = None if column.names_photos else _named_quantity({*column.words})
-        (found[quantity] if quantity else others).append(column)
+    photos = [column for column in layout.columns if column.names_photos]
+    found = columns_by_name([column for column in layout.columns if column not in photos], _IN_POINTS)
+    others = found.pop("")
     found["anchor_id"] = by_id_rather_than_index(found["anchor_id"])
     found |= {axis: coordinates_of_point(found[axis]) for axis in AXES}
     if not found["anchor_id"] and all(found[axis] for axis in AXES):
         texts = [column for column in others if column.kind == "text" and column.num_distinct == len(column.cells)]
-        texts = [column for column in texts if not column.names_photos]
         nameless = [column for column in layout.columns[:1] if column.name == "column 1"]
         found["anchor_id"] = nameless or (texts if len(texts) == 1 else [])
     return found
-
-
-def _named_quantity(words: set[str]) -> str | None:
-    """Return the quantity in a column with these words in its name, or None."""
-    words = words - terms.LINKING
-    about = words - terms.BESIDE_COORDINATE - terms.RANGE
-    if about and about <= terms.STDDEV | terms.BIAS:
-        if not about & terms.BIAS:
-            return "position_stddev"
-        return "range_bias_stddev" if about & terms.STDDEV else "range_bias"
-    own = about - terms.ANCHOR - terms.POINT
-    if axis := next((axis for axis in AXES if own and own <= terms.COORDINATES[axis]), None):
-        return axis
-    return "anchor_id" if words and words <= terms.ANCHOR | terms.ID | terms.POINT else None
 
 
 def _by_values(layout: Layout) -> dict[str, list[ColumnSample]]:

@@ -119,8 +119,8 @@ def _asking_by_commands(paths: Sequence[Path], options: RangesOptions) -> Iterat
     except UnclearFileError as error:
         said = {
             "columns": columns_typed(options.columns),
-            "timestamp_unit": options.timestamp_unit,
-            "range_unit": options.range_unit,
+            "timestamp_unit": options.timestamp_unit or "",
+            "range_unit": options.range_unit or "",
             "separator": options.separator,
         }
         command = ["rangesfm", "ranges", *map(str, paths)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, pairwise, product, takewhile
 
@@ -96,14 +96,8 @@ def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
 
 def named_photos(layout: Layout) -> list[ColumnSample]:
     """Return the columns that name photos without an ending by the names of the columns."""
-    return [
-        column
-        for column in layout.columns
-        if layout.has_names
-        and terms.PHOTO & {*column.words}
-        and {*column.words} <= terms.PHOTO | terms.FILE | terms.ID
-        and (column.kind == "text" or column.is_whole)
-    ]
+    named = columns_by_name(layout.columns if layout.has_names else (), {"photo": terms.NAMING_PHOTOS})["photo"]
+    return [column for column in named if column.kind == "text" or column.is_whole]
 
 
 def is_named_time(column: ColumnSample) -> bool:
@@ -124,6 +118,23 @@ def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
     # Columns like rostopic's %time hold the time of arrival of a message. Its stamp holds the time of measurement.
     is_arrival = column.name.startswith(("%", "__")) or bool(terms.SECOND_TIME & {*words})
     return is_arrival + 0.5 * (not terms.TIME & {*words}), len({*words} - terms.TIME - terms.TIME_IN_SHORT)
+
+
+def columns_by_name(
+    columns: Iterable[ColumnSample], kinds: Mapping[str, tuple[terms.Words, terms.Words]]
+) -> dict[str, list[ColumnSample]]:
+    """Return the columns of each kind by the words in their names, and under "" those of none.
+
+    Args:
+        kinds: words of which the name of such a column has at least one, and those that it may have besides; of several
+            kinds that fit, the first one counts.
+    """
+    found: dict[str, list[ColumnSample]] = {kind: [] for kind in (*kinds, "")}
+    for column in columns:
+        words = {*column.words}
+        kind = next((kind for kind, (own, besides) in kinds.items() if words & own and words <= own | besides), "")
+        found[kind].append(column)
+    return found
 
 
 def _is_since_1970(column: ColumnSample) -> bool:

@@ -15,7 +15,7 @@ def columns_typed(columns: Mapping[str, str]) -> str:
     return ",".join(f"{quantity}={name}" for quantity, name in columns.items())
 
 
-def flags_typed(flags: Mapping[str, str | None]) -> list[str]:
+def flags_typed(flags: Mapping[str, str]) -> list[str]:
     """Return the words that give flags their values; those without a value are left out."""
     return [word for flag, value in flags.items() if value for word in (f"--{flag}", value)]
 
@@ -35,7 +35,7 @@ class Choice:
     def __str__(self) -> str:
         return f"{self.when}, add {shlex.join(flags_typed(self.flags))}"
 
-    def typed(self, command: Sequence[str], said: Mapping[str, str | None]) -> str:
+    def typed(self, command: Sequence[str], said: Mapping[str, str]) -> str:
         """Return the command that reads the file so, where ``said`` are the flags that the user gave."""
         words = shlex.join([*command, *flags_typed({**said, **self.flags})])
         return f"{self.when}: {words}" if self.when else words

@@ -44,7 +44,10 @@ def words_of(name: str) -> list[str]:
     return [word.lower() for word in words]
 
 
-def _words(text: str) -> frozenset[str]:
+Words = frozenset[str]
+
+
+def _words(text: str) -> Words:
     return frozenset(text.split())
 
 
@@ -135,6 +138,8 @@ STDDEV = _words("stddev stdev std sigma sd rms uncertainty accuracy genauigkeit 
 BIAS = _words("bias offset")
 PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
 FILE = _words("file filename filenames name names path datei dateiname fichier nom source sourcefile archivo")
+# Words of a name of photos without an ending, and those beside them.
+NAMING_PHOTOS = (PHOTO, FILE | ID)
 # Words in the names of columns of measured lengths, and of marks in photos.
 FROM = _words("from von de desde da start begin anfang début debut inicio")
 TO = _words("to nach bis à hasta end ende fin")
