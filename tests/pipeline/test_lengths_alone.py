@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from tests.known import assert_scale, known
 from tests.outputs import paths_in
+from tests.simulated.files import write_rows
 from tests.simulated.model import SyntheticModel
 from tests.simulated.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 
@@ -103,6 +104,16 @@ def test_of_one_length_the_verdict_says_that_nothing_checks_it(room: Room, tmp_p
     assert summary.scale.verdict == "doubtful"
     assert "one length that nothing checks" in summary.scale.reasons[0]
     assert summary.tests[0].smallest_detectable is None
+
+
+def test_a_map_that_needs_no_times_is_compared_with_a_truth_that_has_them(room: Room, tmp_path: Path) -> None:
+    times, truth = tmp_path / "times.csv", tmp_path / "truth.csv"
+    write_rows(times, "image_name,timestamp_s", room.made.timestamps_s.items())
+    path = zip(room.made.timestamps_s.values(), *room.made.centers_m.T, strict=True)
+    write_rows(truth, "timestamp_s,x_m,y_m,z_m", path)
+    survey = room.survey(tmp_path, scale__distances=room.taped(tmp_path, PAIRS[:3]), images__times=times)
+    result = scale_model(survey.changed({"report.reference": truth}), progress=QUIET)
+    assert result.summary.comparison[0].num_keyframes == len(room.made.timestamps_s)
 
 
 def test_photos_of_printed_tags_become_a_metric_map_by_init_and_run(room: Room, tmp_path: Path) -> None:

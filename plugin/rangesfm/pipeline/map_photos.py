@@ -112,12 +112,12 @@ def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
 
 
 def with_times_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyRun:
-    """Return the survey with the times of the photos of its model, if any are needed.
+    """Return the survey with the times of the photos of its model, if any are needed, also to compare with a reference.
 
     Raises:
         InputError: no photo has a time, or times are wrong.
     """
-    if not run.inputs.needs_times:
+    if not (run.inputs.needs_times or isinstance(run.inputs.reference.moments, ByTime)):
         return run
     times = times_of_model(run.survey, sfm, run.survey.given_model_path)
     run.journal.note(*times.assumed)
