@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_range, is_rising, named_photos
+from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_range, is_rising, named_photos, names_of
 from rangesfm.measurements.ranges.readers.layout import Layout
 from rangesfm.measurements.ranges.readers.lists import (
     TableForm,
@@ -66,7 +66,7 @@ def find_photo_columns(form: TableForm, path: Path, layout: Layout) -> dict[str,
         find_time(others, guess)
     doubts = []
     if len({tuple(map(os.path.basename, column.cells)) for column in photos}) > 1:
-        doubts.append(f"any of {', '.join(column.name for column in photos)} may be the photo")
+        doubts.append(f"any of {names_of(photos)} may be the photo")
     if "timestamp" not in guess.columns:
         times = [column for column in others if column.kind == "times" or (len(others) == 1 and is_rising(column))]
         if len(times) != 1:

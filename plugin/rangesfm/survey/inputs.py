@@ -192,9 +192,9 @@ def _surveyed_positions(
     Raises:
         InputError: a file is wrong, or only one of anchors and points has a coordinate system.
     """
-    points, asked = read_control_points(survey.points), survey.positions
-    folder = asked.path if asked.path is not None and asked.path.is_dir() else None
-    log = read_positions(asked) if folder is None else read_exif_positions(folder)
+    points, asked, log = read_control_points(survey.points), survey.positions, None
+    if asked.path is not None:
+        log = read_exif_positions(asked.path) if asked.path.is_dir() else read_positions(asked.path, asked)
     if not points.points and log is None:
         return site, NO_POSITIONS
     if frame == "first_camera":

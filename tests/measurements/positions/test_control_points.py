@@ -57,6 +57,11 @@ def test_columns_can_be_named_and_unclear_ones_are_asked_for_by_the_flags_of_poi
         read(tmp_path, "point,north,east,up,h\nP,1,2,3,4\nQ,4,5,6,5\n")
     assert "a table of points whose columns are not known for sure" in str(error.value)
     assert any("--point_columns marker=point," in choice for choice in map(str, error.value.choices))
+    with pytest.raises(UnclearFileError) as error:
+        read(tmp_path, text := "point,y,x,z,sigma\nP,1,2,3,0.1\nQ,4,5,6,0.2\n")
+    chosen = error.value.choices[0].flags["point_columns"]
+    found = read(tmp_path, text, columns=dict(pair.split("=") for pair in chosen.split(",")))
+    assert [(p.name, p.stddev_m) for p in found.points] == [("P", 0.1), ("Q", 0.2)]
 
 
 @pytest.mark.parametrize(

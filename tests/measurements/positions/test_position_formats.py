@@ -24,9 +24,7 @@ def read(folder: Path, text: str, **options: object) -> PositionLog:
     """Write a file and read it."""
     path = folder / "positions.txt"
     path.write_text(text)
-    found = read_positions(PositionOptions().changed(path=path, **options))
-    assert found is not None
-    return found
+    return read_positions(path, PositionOptions().changed(**options))
 
 
 def nmea(*bodies: str) -> str:
@@ -130,8 +128,7 @@ def test_pose_priors_of_a_database_are_positions_of_its_photos(tmp_path: Path, s
             )
             database.write_pose_prior(prior)
     before = path.read_bytes()
-    found = read_positions(PositionOptions().changed(path=path))
-    assert found is not None
+    found = read_positions(path, PositionOptions())
     assert found.moments.image_name == ("0.jpg", "1.jpg", "2.jpg")
     is_geographic = system == "WGS84"
     assert found.crs == (GEOGRAPHIC if is_geographic else "")

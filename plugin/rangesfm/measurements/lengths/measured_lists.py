@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.guess import columns_by_name
+from rangesfm.measurements.ranges.readers.guess import columns_by_name, names_of
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout
 from rangesfm.measurements.ranges.readers.lists import TableForm
 
@@ -46,7 +46,7 @@ def _only_columns(
         return None
     for quantity in form.required:
         if (num := len(those := found.get(quantity, []))) != 1:
-            which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
+            which = f"columns {names_of(those)} may all be" if num else "no column is"
             listed = printable(", ".join(layout.names))
             message = f"a table of {form.what} in which {which} {form.names[quantity]}; found {listed}"
             raise InputError(f"{message}; {form.expected}", path)

@@ -54,16 +54,13 @@ _NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f
 Reader = Callable[[Path, PositionOptions], PositionLog]
 
 
-def read_positions(options: PositionOptions) -> PositionLog | None:
-    """Read the positions that a survey names; None if it names none.
+def read_positions(path: Path, options: PositionOptions) -> PositionLog:
+    """Read a file of positions.
 
     Raises:
         UnclearFileError: the columns are not known for sure; the advice says what to type.
         InputError: the file is not valid; the error gives the line.
     """
-    path = options.path
-    if path is None:
-        return None
     if options.format:
         if options.format not in POSITION_READERS:
             near = nearest_known(options.format, POSITION_READERS)

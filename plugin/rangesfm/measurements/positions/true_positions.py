@@ -25,10 +25,9 @@ def read_true_positions(path: AnyPath) -> Reference:
     if path.suffix == ".tum" or is_reference_file(read_head(path)):
         return read_reference(path)
     try:
-        log = read_positions(PositionOptions().changed(path=path))
+        log = read_positions(path, PositionOptions())
     except UnclearFileError as error:
         raise InputError(f"{'; '.join(error.about)}; {_EXPECTED}", path) from None
-    assert log is not None
     if log.crs:
         raise InputError(f"the positions are in {log.crs}, expected metres in the frame of the map", path)
     return Reference(log.position_m, log.moments, notes=log.notes)

@@ -18,6 +18,7 @@ from rangesfm.measurements.ranges.readers.guess import (
     columns_by_name,
     is_named_time,
     is_range,
+    names_of,
 )
 from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.lists import (
@@ -124,7 +125,7 @@ def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] |
     for quantity, what in (("anchor_id", "the anchor's id"), ("x", "x"), ("y", "y"), ("z", "z (height)")):
         several = found[quantity]
         if len(several) > 1:
-            doubts.append(f"any of {_listed(several)} may be {what}")
+            doubts.append(f"any of {names_of(several)} may be {what}")
             choices += [form.choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
         elif not several and not degrees:
             doubts.append(f"no column seems to be {what}")
@@ -195,10 +196,6 @@ def _ways_to_complete(form: TableForm, layout: Layout, columns: Mapping[str, str
 
 def _may_be_id(column: ColumnSample) -> bool:
     return column.kind == "text" or column.is_whole
-
-
-def _listed(columns: Sequence[ColumnSample]) -> str:
-    return ", ".join(column.name for column in columns)
 
 
 def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:

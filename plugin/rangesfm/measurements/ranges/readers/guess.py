@@ -90,7 +90,7 @@ def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     elif time.is_whole and fractions and float(np.median(time.numbers)) < 1e11:
         guess.columns["nanoseconds"] = fractions[0].name
     if also := [column for column in others if column not in fractions]:
-        guess.notes.append(f"the times are taken from {time.name}; there are also {_names(also)}")
+        guess.notes.append(f"the times are taken from {time.name}; there are also {names_of(also)}")
     return [column for column in free if column not in (time, *others, *dates, *fractions)]
 
 
@@ -171,7 +171,7 @@ def _names_anchor(column: ColumnSample) -> bool:
     return bool(words) and words <= terms.ANCHOR | terms.ASKED | terms.ID and (column.kind == "text" or column.is_whole)
 
 
-def _names(columns: Iterable[ColumnSample]) -> str:
+def names_of(columns: Iterable[ColumnSample]) -> str:
     return ", ".join(column.name for column in columns)
 
 
@@ -198,9 +198,9 @@ def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     if first:
         guess.columns["range"] = first[0].name
         if len(first) > 1:
-            guess.doubts.append(f"any of {_names(first)} may be the ranges")
+            guess.doubts.append(f"any of {names_of(first)} may be the ranges")
         elif others := [column for column in single if column not in first]:
-            guess.notes.append(f"the ranges are taken from {first[0].name}; there are also {_names(others)}")
+            guess.notes.append(f"the ranges are taken from {first[0].name}; there are also {names_of(others)}")
     elif groups:
         _take_wide(groups[0], guess)
         guess.doubts += ["there are several groups of columns that may be ranges"] * (len(groups) > 1)
@@ -262,7 +262,7 @@ def _take_wide(group: list[tuple[ColumnSample, list[int]]], guess: Guess) -> Non
         have_tags |= bool(tags)
     guess.columns |= wide
     words = {word for column, _ in group for word in column.words}
-    first = _names(column for column, _ in group[:4])
+    first = names_of(column for column, _ in group[:4])
     guess.notes.append(f"one column per anchor: {first}{', ..' * (len(group) > 4)}")
     if len(wide) < len(group):
         guess.doubts.append("the names of several columns hold the same id")
@@ -321,7 +321,7 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
         if columns and not (guess.is_wide and role == "anchor_id"):
             guess.columns[role] = columns[0].name
             if len(columns) > 1:
-                guess.doubts.append(f"any of {_names(columns)} may be the {role}")
+                guess.doubts.append(f"any of {names_of(columns)} may be the {role}")
     unlike = terms.NO_RANGE - terms.ANY_ID
     others = [column for column in varying if not unlike & {*column.words}]
     if others and not (guess.is_wide or anchor):
@@ -373,7 +373,7 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
     if len(pairs) > 1:
         _take_pairs(pairs, guess)
         if 2 * len(pairs) < len(free) or len({node.cells[0] for node, _ in pairs}) < len(pairs):
-            guess.doubts.append(f"{_names(node for node, _ in pairs)} may be the anchors")
+            guess.doubts.append(f"{names_of(node for node, _ in pairs)} may be the anchors")
         return
     ids = [column for column in free if _is_id(column)]
     reals = [column for column in free if column.kind == "numbers" and column not in ids and _is_positive(column)]
@@ -420,7 +420,7 @@ def _ids_by_values(ids: list[ColumnSample], guess: Guess) -> None:
     *others, anchor = sorted(ids, key=lambda column: column.num_distinct)
     tag = others[-1] if others else None
     if len(others) > 1:
-        guess.doubts.append(f"any of {_names(ids)} may be the anchor or the tag")
+        guess.doubts.append(f"any of {names_of(ids)} may be the anchor or the tag")
     guess.columns["anchor_id"] = anchor.name
     if tag is not None:
         guess.columns["tag_id"] = tag.name

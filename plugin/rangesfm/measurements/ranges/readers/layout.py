@@ -402,7 +402,7 @@ def _read_records(path: Path) -> TextTable | None:
     A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
     """
     head = read_head(path).lstrip()
-    if _is_gsi(head):
+    if _GSI_BLOCK.match(head):
         numbered = [*_gsi_records(read_text(path, errors="replace"))]
     elif head.startswith(("{", "[{")) or _share_json(head) > _MIN_SHARE_JSON:
         numbered = list(_json_records(read_text(path)))
@@ -533,11 +533,6 @@ _GSI_POINT = "11"
 _GSI_COORDINATES = (("81", "82", "83"), ("84", "85", "86"))
 # Length of one unit in the last place, in metres, by the digit for units.
 _GSI_METRES = {"0": 1e-3, "1": 0.3048e-3, "6": 1e-4, "7": 0.3048e-4, "8": 1e-5}
-
-
-def _is_gsi(head: str) -> bool:
-    """Return whether a file with this beginning is a GSI file with measured points."""
-    return _GSI_BLOCK.match(head.lstrip()) is not None
 
 
 def _gsi_records(text: str) -> Iterator[tuple[int, dict[str, str]]]:
