@@ -27,7 +27,8 @@ def main() -> None:
     for result in (before, after):
         if result.summary.frame != "site":
             sys.exit(
-                f"{result.path}: in the frame {result.summary.frame!r}; only maps in one site frame can be compared"
+                f"{result.output_path}: in the frame {result.summary.frame!r}; only maps in one site frame can be "
+                "compared"
             )
     old, new = metric_model(before), metric_model(after)
     points = positions(new)
@@ -51,7 +52,7 @@ def main() -> None:
 def metric_model(result: ResultFolder) -> pycolmap.Reconstruction:
     model = result.read_metric_model()
     if model is None:
-        sys.exit(f"{result.path}: no metric model")
+        sys.exit(f"{result.output_path}: no metric model")
     return model
 
 

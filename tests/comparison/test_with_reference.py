@@ -17,12 +17,12 @@ from rangesfm.comparison.before_after import compare_folder, compare_models
 from rangesfm.comparison.same_photos import reprojection_rms_px
 from rangesfm.comparison.with_reference import (
     compare,
-    format_table,
     papers_table,
     reference_in_frame,
     with_true_scale,
 )
 from rangesfm.errors import InputError
+from rangesfm.result.comparison_row import format_table
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, write_reference

@@ -14,9 +14,8 @@ from tests.known import known
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import SolverError
 from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import Progress
-from rangesfm.result.result_folder import is_refined_model, read_result_folder
+from rangesfm.result.result_folder import ResultFolder, is_refined_model, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
@@ -92,7 +91,7 @@ def spoilt(survey: Survey, spoil: Spoil) -> Survey:
     return survey
 
 
-def refined(survey: Survey) -> RunResult:
+def refined(survey: Survey) -> ResultFolder:
     return refine_model(survey, progress=Progress())
 
 

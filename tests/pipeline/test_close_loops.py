@@ -20,8 +20,9 @@ from rangesfm.estimation import refinement
 from rangesfm.pipeline.close_loops import close_loops_of_survey
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import refine_model
-from rangesfm.pipeline.run_results import RunResult, write_results
+from rangesfm.pipeline.run_results import write_results
 from rangesfm.progress import Journal, Progress
+from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import LoopPairs
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.loop_database import LoopMatching
@@ -91,7 +92,7 @@ def closed(laps: Laps) -> ClosedLaps:
             refine_model(laps.survey, progress=Progress())
     written: list[MetricResult] = []
 
-    def write(run: SurveyRun, made: MetricResult) -> RunResult:
+    def write(run: SurveyRun, made: MetricResult) -> ResultFolder:
         written.append(made)
         return write_results(run, made)
 

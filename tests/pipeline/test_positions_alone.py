@@ -21,8 +21,8 @@ from tests.simulated.surveys import mapped, yard_truth
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import Progress
+from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.similarity import rmse
@@ -135,7 +135,7 @@ def test_positions_with_a_lever_arm_and_another_clock_place_the_map(walk: Walk, 
 
 @pytest.mark.parametrize("run", [scale_model, refine_model])
 def test_a_radio_system_that_measures_its_site_too_small_is_no_good_scale_and_its_interval_says_so(
-    walk: Walk, tmp_path: Path, run: Callable[..., RunResult]
+    walk: Walk, tmp_path: Path, run: Callable[..., ResultFolder]
 ) -> None:
     survey = walk.survey(
         tmp_path,
@@ -268,7 +268,7 @@ def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
 
 @pytest.mark.parametrize("run", [scale_model, refine_model])
 def test_ranges_and_positions_have_the_say_on_the_scale_that_their_errors_allow(
-    walk: Walk, tmp_path: Path, run: Callable[..., RunResult]
+    walk: Walk, tmp_path: Path, run: Callable[..., ResultFolder]
 ) -> None:
     scale = run(walk.with_both(tmp_path, 1.03), progress=QUIET).summary.scale
     values = {kind: np.log(entry.value) for kind, entry in scale.by_kind.items()}

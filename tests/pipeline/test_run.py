@@ -27,10 +27,9 @@ from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.pipeline import run
 from rangesfm.pipeline.export_result import export_result
 from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import Journal, Progress
 from rangesfm.result.places import path_in, recorded_path
-from rangesfm.result.result_folder import is_refined_model
+from rangesfm.result.result_folder import ResultFolder, is_refined_model
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import KEYS, Survey
@@ -80,7 +79,7 @@ class Done:
     """The result of a stage on the survey, and its messages. Tests must not write to it."""
 
     survey: Survey
-    result: RunResult
+    result: ResultFolder
     listener: Listener
 
 
@@ -264,12 +263,12 @@ class TestSeveralTags:
 
     @pytest.fixture(scope="class")
     @classmethod
-    def exact(cls, survey: Survey) -> RunResult:
+    def exact(cls, survey: Survey) -> ResultFolder:
         """The refined map with the lever arm of each tag."""
         return refine_model(survey, progress=Progress())
 
     def test_map_is_exact_where_each_has_its_lever_arm(
-        self, survey: Survey, exact: RunResult, made: SyntheticModel
+        self, survey: Survey, exact: ResultFolder, made: SyntheticModel
     ) -> None:
         result = exact.summary
         assert result.scale.value == pytest.approx(made.metric_from_sfm.scale, rel=1e-6)
@@ -287,7 +286,7 @@ class TestSeveralTags:
         assert known(result.ranges.rms_m) > 0.05
 
     def test_ranges_between_two_of_a_kind_are_in_the_results_with_their_status(
-        self, survey: Survey, exact: RunResult
+        self, survey: Survey, exact: ResultFolder
     ) -> None:
         result = exact.summary
         assert (result.ranges.num_anchor_anchor, result.ranges.num_tag_tag) == (1, 1)

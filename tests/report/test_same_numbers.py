@@ -15,7 +15,7 @@ import rangesfm
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
 
-    from rangesfm.pipeline.run_results import RunResult
+    from rangesfm.result.result_folder import ResultFolder
 
 # Half the width of a 95 % interval, in standard deviations.
 HALF = 1.96
@@ -28,7 +28,7 @@ class Told:
     lines: list[str]
     page: str
     result: dict[str, Any]
-    python: RunResult
+    python: ResultFolder
 
     def line(self, begin: str) -> str:
         (line,) = (line for line in self.lines if line.startswith(begin))

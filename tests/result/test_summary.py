@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from tests.result_document import REFINE, anchor_entry, result_document
 
-from rangesfm.comparison.with_reference import format_table
 from rangesfm.errors import InputError, number_text
-from rangesfm.result.comparison_row import ComparisonRow
+from rangesfm.result.comparison_row import ComparisonRow, format_table
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.summary import ResultSummary, schema
 
@@ -133,8 +132,14 @@ def test_a_number_that_rounds_to_zero_has_no_sign() -> None:
 
 def test_lines_for_people_tell_what_is_known() -> None:
     sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": None}
-    document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
-    lines = list(ResultSummary.model_validate(document).lines(Path("out"), "a  b\nc  d"))
+    row = {"name": "scaled", "num_keyframes": 9, "rmse_m": None, "rmse_se3_m": 0.02, "rmse_sim3_m": 0.01}
+    document = result_document(
+        scale=sensitive,
+        refine=REFINE,
+        ranges={"num": 9, "num_used": 7, "rms_m": 0.0512},
+        comparison=[{**row, "scale_error_percent": 0.5}],
+    )
+    lines = list(ResultSummary.model_validate(document).lines(Path("out")))
     assert lines == [
         "scale: 1.5 m per SfM unit, no interval",
         "verdict: good: the scale is known to 2 % (95 % interval)",
@@ -142,7 +147,10 @@ def test_lines_for_people_tell_what_is_known() -> None:
         "refined in 23 iterations; it changed the shape of the camera's path by 0.01 m (rms)",
         "ranges: 7 of 9 used; they differ from the map by 0.051 m (rms)",
         "map: 40 photos, 900 points, frame site",
-        *("", "a  b", "c  d", ""),
+        "",
+        "trajectory  keyframes  RMSE m  after SE(3)  after Sim(3)  scale error",
+        "scaled              9       -       0.0200        0.0100     +0.500 %",
+        "",
         f"metric model: {Path('out/sparse_metric/0')}",
         f"all results: {Path('out/result.json')}",
     ]

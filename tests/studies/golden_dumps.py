@@ -58,7 +58,8 @@ from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.pipeline import result_records
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.run_results import RunResult, write_results
+from rangesfm.pipeline.run_results import write_results
+from rangesfm.result.result_folder import ResultFolder
 
 Values = dict[str, npt.NDArray[Any]]
 Tables = dict[str, dict[str, Any]]
@@ -207,7 +208,7 @@ def metric_of(survey_path: Path, output_path: Path) -> MetricResult:
     """Run a survey as ``rangesfm`` does, and return what is in memory when the results are written."""
     kept: list[MetricResult] = []
 
-    def write(run: Any, metric: MetricResult) -> RunResult:
+    def write(run: Any, metric: MetricResult) -> ResultFolder:
         kept.append(metric)
         return write_results(run, metric)
 

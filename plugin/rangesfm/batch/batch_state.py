@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from rangesfm.batch.jobs import Job
-from rangesfm.comparison.with_reference import text_or_dash
 from rangesfm.errors import FAILED, INTERNAL_ERROR, Failure, one_line
+from rangesfm.result.comparison_row import text_or_dash
 from rangesfm.result.summary import ResultSummary
 from rangesfm.util.files.text_tables import align_rows
 

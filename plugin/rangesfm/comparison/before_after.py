@@ -11,8 +11,9 @@ import pycolmap
 
 from rangesfm.arrays import Array, median, rms
 from rangesfm.comparison.same_photos import Length, common_photos, lengths_along, reprojection_rms_px
-from rangesfm.comparison.with_reference import format_table, papers_table
+from rangesfm.comparison.with_reference import papers_table
 from rangesfm.errors import InputError
+from rangesfm.result.comparison_row import format_table
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.text_tables import align_rows

@@ -16,13 +16,14 @@ from rangesfm.arrays import Array, rms
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import NO_RANGES, ModelRanges, ranges_of_result
 from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
-from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
+from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.lengths.tape_file import markers_of_photos
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.report.report_tables import ReportTable
+from rangesfm.result.comparison_row import text_or_dash
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model

@@ -84,7 +84,7 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         timestamp_s=times,
         image_name=names,
         tag_id=tag_ids,
-        source=result.path / RangesAsUsed.NAME,
+        source=result.output_path / RangesAsUsed.NAME,
     )
     return ModelRanges(
         log=log,

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError, number_text
-from rangesfm.result.comparison_row import ComparisonRow, rmse_heading
-from rangesfm.util.files.text_tables import align_rows
+from rangesfm.errors import InputError
+from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 from rangesfm.util.geometry.similarity import Similarity, align_points, rmse, similarity_between
@@ -130,23 +128,3 @@ def _in_frame(
 def similarity_onto(source: Array, target: Array) -> Similarity | None:
     """Return the best similarity from source to target, (n, 3) each; None if it is not determined or n is below 3."""
     return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
-
-
-def format_table(rows: tuple[ComparisonRow, ...], frame: str) -> str:
-    """Return the rows as a table in plain text, lengths in metres; ``frame`` as in ``compare``."""
-    header = ("trajectory", "keyframes", rmse_heading(frame), "after SE(3)", "after Sim(3)", "scale error")
-    cells = [
-        (
-            row.name,
-            str(row.num_keyframes),
-            *(text_or_dash(length_m, ".4f") for length_m in (row.rmse_m, row.rmse_se3_m, row.rmse_sim3_m)),
-            text_or_dash(row.scale_error_percent, "+.3f", " %"),
-        )
-        for row in rows
-    ]
-    return align_rows([header, *cells])
-
-
-def text_or_dash(value: float | None, spec: str, unit: str = "") -> str:
-    """Return a number as text with its unit, or "-" where it is unknown, for a table in plain text."""
-    return "-" if value is None or math.isnan(value) else f"{number_text(value, spec)}{unit}"

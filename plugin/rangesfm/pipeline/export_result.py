@@ -112,7 +112,7 @@ def _in_other_frames(map_: MetricMap, options: ExportOptions) -> Iterator[Metric
 def _read_map(result: ResultFolder) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
-        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
+        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.output_path)
     result.path_in(reconstruction)  # raises an error where no photo has a time: the trajectory would be empty
     return MetricMap(
         reconstruction,
@@ -121,7 +121,7 @@ def _read_map(result: ResultFolder) -> MetricMap:
         metric_from_sfm=summary.metric_from_sfm.similarity,
         relative_scale_stddev=summary.scale.relative_stddev_empirical,
         images_path=result.images_path,
-        database_path=result.path / DATABASE_NAME,
+        database_path=result.output_path / DATABASE_NAME,
         is_site=summary.frame == "site",
         upward=None if summary.up is None else summary.up[0],
         georeference=None if summary.georeference is None else summary.georeference.georeference,

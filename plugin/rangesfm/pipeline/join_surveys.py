@@ -23,7 +23,6 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.run import map_in_metres, with_results
-from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
@@ -83,7 +82,7 @@ def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
     timed = [survey for survey in surveys if survey.path.timestamps_s is not None]
     if timed and len(timed) < len(surveys):
         bare = next(survey for survey in surveys if survey.path.timestamps_s is None)
-        raise InputError(f"its photos have no times, but those of {timed[0].name} have", bare.result.path)
+        raise InputError(f"its photos have no times, but those of {timed[0].name} have", bare.result.output_path)
     surveys, counts = _with_tags_of_their_own(surveys), Counter(name for one in surveys for name in one.own_name)
     return surveys if max(counts.values(), default=1) == 1 else list(map(_renamed, surveys))
 
@@ -105,12 +104,14 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _read(name: str, result: ResultFolder) -> FinishedRun:
     model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
     if not ranges:
-        raise InputError("has no ranges.csv: surveys are joined through anchors, so each needs ranges", result.path)
+        raise InputError(
+            "has no ranges.csv: surveys are joined through anchors, so each needs ranges", result.output_path
+        )
     path = result.path_in(model)
     if not is_one_after_the_other(path):
         expected = "expected the result of one survey: join all surveys at once"
         raise InputError(
-            f"two of its photos have the same time, as in a map of several cameras, {expected}", result.path
+            f"two of its photos have the same time, as in a map of several cameras, {expected}", result.output_path
         )
     own_name = {image.name: image.name for image in model.images.values()}
     of_two_anchors = RangeStatus.ANCHOR_ANCHOR.label
@@ -122,7 +123,7 @@ def _unscaled_model(result: ResultFolder) -> pycolmap.Reconstruction:
     """Return ``sparse/0``, or the scaled model where ``sparse/0`` has other photos; its scale does not matter here."""
     scaled = result.read_model("sparse_scaled")
     if scaled is None:
-        raise InputError("there is no sparse_scaled/0, expected the output_path of a run", result.path)
+        raise InputError("there is no sparse_scaled/0, expected the output_path of a run", result.output_path)
     sfm = result.read_model("sparse")
     return sfm if sfm is not None and _registered(sfm) == _registered(scaled) else scaled
 
@@ -234,7 +235,7 @@ def paths_of_surveys(
 
 
 @with_one_blas_thread
-def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress = SILENT) -> RunResult:
+def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress = SILENT) -> ResultFolder:
     """Make one map of several surveys from the results of their runs.
 
     Args:
@@ -306,7 +307,7 @@ def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
                     raise InputError(
                         f"anchor {anchor.anchor_id!r} is {off_m:.3f} m from its position in another survey's file: "
                         "give --anchors CSV for all of them",
-                        one.result.path,
+                        one.result.output_path,
                     )
     return tuple(by_id.values())
 
@@ -320,10 +321,12 @@ def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
         raise InputError(
             "its anchors are in the frame of its own first photo, which other surveys do not share: give --anchors CSV "
             "in a site frame, or --anchor_frame unknown",
-            one.result.path,
+            one.result.output_path,
         )
     if not path.is_file():
-        raise InputError(f"its file of anchors does not exist any more, {path}: give --anchors CSV", one.result.path)
+        raise InputError(
+            f"its file of anchors does not exist any more, {path}: give --anchors CSV", one.result.output_path
+        )
     return read_anchors(path, columns=anchors.columns, unit=anchors.unit)
 
 

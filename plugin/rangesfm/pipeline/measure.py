@@ -110,7 +110,7 @@ def measure(
     result = read_result_folder(Path(result_folder))
     if result.summary.scale.interval_95 is None:
         said = f"the scale has no interval ({result.summary.scale.method})"
-        raise InputError(f"{said}, so that no length in the map has one", result.path)
+        raise InputError(f"{said}, so that no length in the map has one", result.output_path)
     points = _points_of(result, {} if markers is None else read_markers(markers))
     errors, up, stddev = result.read_map_errors(), result.summary.up, result.summary.scale.relative_stddev_empirical
     notes = [] if errors.are_known else [_SCALE_ALONE]
@@ -187,12 +187,14 @@ def _points_of(result: ResultFolder, more_markers: Mapping[str, Marker]) -> Name
     """Return the points of a result: with corners of printed tags that it found, and markers that its survey gave."""
     model = result.read_metric_model()
     if model is None:
-        raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to measure in", result.path)
+        raise InputError(
+            "there is no metric model (sparse_metric/0 or sparse_scaled/0) to measure in", result.output_path
+        )
     found: dict[str, Marker] = {}
-    if (result.path / TagCorners.NAME).is_file():
-        found |= read_markers(result.path / TagCorners.NAME, FOUND_STDDEV_PX)
+    if (result.output_path / TagCorners.NAME).is_file():
+        found |= read_markers(result.output_path / TagCorners.NAME, FOUND_STDDEV_PX)
     recorded = result.summary.settings.to_json().get("scale", {}).get("markers")
-    given = None if recorded is None else input_beside(result.path, recorded)
+    given = None if recorded is None else input_beside(result.output_path, recorded)
     found |= read_markers(given) if given is not None and given.is_file() else {}
     markers = markers_of_photos({**found, **more_markers}, [image.name for image in model.images.values()])
     refine = result.summary.refine

@@ -34,8 +34,9 @@ from rangesfm.pipeline.map_photos import (
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.place_ranges import place_ranges
 from rangesfm.pipeline.plan_again import with_advice
-from rangesfm.pipeline.run_results import RunResult, write_results
+from rangesfm.pipeline.run_results import write_results
 from rangesfm.progress import SILENT, Journal, Progress
+from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
@@ -49,7 +50,7 @@ _Sensor = TypeVar("_Sensor")
 
 
 @with_one_blas_thread
-def run_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = False) -> RunResult:
+def run_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = False) -> ResultFolder:
     """Make the metric model of a survey and write the result folder, as ``rangesfm run`` does.
 
     Args:
@@ -71,7 +72,7 @@ def run_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = F
     return _from_model(survey, progress, refine=survey.refine.enabled, or_scale=True)
 
 
-def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> RunResult:
+def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> ResultFolder:
     run = begin_run(survey, Journal(progress))
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
@@ -98,18 +99,18 @@ def reconstruct_survey(survey: Survey, *, progress: Progress = SILENT, restart: 
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
 
-def refine_model(survey: Survey, *, progress: Progress = SILENT) -> RunResult:
+def refine_model(survey: Survey, *, progress: Progress = SILENT) -> ResultFolder:
     """Make a refined metric model from an existing model and ranges, and write the result folder."""
     return _from_model(survey, progress, refine=True)
 
 
-def scale_model(survey: Survey, *, progress: Progress = SILENT) -> RunResult:
+def scale_model(survey: Survey, *, progress: Progress = SILENT) -> ResultFolder:
     """Scale an existing model, or a model with poses only, by ranges, and write the result folder."""
     return _from_model(survey, progress, refine=False)
 
 
 @with_one_blas_thread
-def _from_model(survey: Survey, progress: Progress, *, refine: bool, or_scale: bool = False) -> RunResult:
+def _from_model(survey: Survey, progress: Progress, *, refine: bool, or_scale: bool = False) -> ResultFolder:
     """Scale or refine a given model; ``or_scale``: a model without points is scaled where it should be refined."""
     run = begin_run(survey, Journal(progress))
     sfm = read_registered(survey.given_model_path, run.journal)
@@ -214,7 +215,7 @@ def _in_map(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyRun:
     return replace(run, inputs=replace(run.inputs, tape=in_map))
 
 
-def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
+def with_results(run: SurveyRun, made: MetricResult) -> ResultFolder:
     """Add advice for the next survey to a map, compare it with the reference, and write all results."""
     with run.journal.stage("advice"):
         advised = with_advice(made)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
+from rangesfm.comparison.with_reference import papers_table, reference_in_frame
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
 from rangesfm.measurements.kind import Doubt
@@ -20,8 +19,7 @@ from rangesfm.report.content import Content
 from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.result.joint_covariance import write_map_errors
 from rangesfm.result.places import recorded_path, recorded_settings
-from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
-from rangesfm.result.summary import ResultSummary
+from rangesfm.result.result_folder import REFERENCE_NAME, ResultFolder, new_result, read_result_folder
 from rangesfm.sfm.steps import DATABASE_NAME
 from rangesfm.solver.installation_checks import recorded_versions
 from rangesfm.survey.settings import Survey
@@ -31,24 +29,7 @@ from rangesfm.util.files.atomic import path_of
 from rangesfm.util.geometry.reference import write_reference
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """Outcome of a run. Its files are read by ``read_result_folder``.
-
-    Attributes:
-        lines: summary for the user.
-    """
-
-    output_path: Path
-    summary: ResultSummary
-    lines: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        """Return the summary for the user."""
-        return "\n".join(self.lines)
-
-
-def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
+def write_results(run: SurveyRun, metric: MetricResult) -> ResultFolder:
     """Write all files of the result, with ``result.json`` last, and the report.
 
     Raises:
@@ -85,12 +66,9 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             with journal.stage("report"):
                 content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
                 write_report_of(content, staged)
-    lines = [*summary.lines(folder, format_table(comparison, summary.frame) if comparison else "")]
-    if survey.report.enabled:
-        lines.append(f"report: {folder / REPORT_NAME}")
     if not_exported is not None:
         raise not_exported
-    return RunResult(folder, summary, tuple(lines))
+    return ResultFolder(folder, summary, metric.trajectory.times_by_name)
 
 
 def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:

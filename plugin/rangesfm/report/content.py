@@ -63,7 +63,7 @@ class Content:
         """
         self.result, self.summary = result, result.summary
         given = self.summary.settings.report
-        folder = real_path(home or result.path)
+        folder = real_path(home or result.output_path)
         own_name = folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
         self.title, self.by = title or given.title or own_name, by or given.by or ""
         self.images_path = images_path or result.images_path

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
+from rangesfm.errors import number_text
 from rangesfm.util.files.records import Count, NumberOrNull, Record, Text
+from rangesfm.util.files.text_tables import align_rows
 
 
 class ComparisonRow(Record):
@@ -31,3 +35,23 @@ class ComparisonRow(Record):
 def rmse_heading(frame: str) -> str:
     """Return the heading of a column of ``ComparisonRow.rmse_m``, given the frame of the compared paths."""
     return "RMSE m by first pose" if frame == "first_camera" else "RMSE m"
+
+
+def format_table(rows: tuple[ComparisonRow, ...], frame: str) -> str:
+    """Return the rows as a table in plain text, lengths in metres; ``frame`` is that of the paths."""
+    header = ("trajectory", "keyframes", rmse_heading(frame), "after SE(3)", "after Sim(3)", "scale error")
+    cells = [
+        (
+            row.name,
+            str(row.num_keyframes),
+            *(text_or_dash(length_m, ".4f") for length_m in (row.rmse_m, row.rmse_se3_m, row.rmse_sim3_m)),
+            text_or_dash(row.scale_error_percent, "+.3f", " %"),
+        )
+        for row in rows
+    ]
+    return align_rows([header, *cells])
+
+
+def text_or_dash(value: float | None, spec: str, unit: str = "") -> str:
+    """Return a number as text with its unit, or "-" where it is unknown, for a table in plain text."""
+    return "-" if value is None or math.isnan(value) else f"{number_text(value, spec)}{unit}"

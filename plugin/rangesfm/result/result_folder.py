@@ -79,16 +79,27 @@ def new_result(folder: Path, images_path: Path | None = None) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """The output folder of a run, read back for comparison, export, report and joining.
+    """The output folder of a run, with what it found. Models and tables are read on demand.
 
     Attributes:
+        output_path: the folder.
         summary: content of ``result.json``.
         timestamps_s: time of each photo by name; empty where the photos have no times.
     """
 
-    path: Path
+    output_path: Path
     summary: ResultSummary
     timestamps_s: dict[str, float]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return the result as lines of text for the user."""
+        report = self.output_path / REPORT_NAME
+        return (*self.summary.lines(self.output_path), *([f"report: {report}"] if report.is_file() else []))
+
+    def __repr__(self) -> str:
+        """Return these lines."""
+        return "\n".join(self.lines)
 
     @property
     def anchor_positions_m(self) -> dict[str, Array]:
@@ -103,13 +114,13 @@ class ResultFolder:
     def images_path(self) -> Path | None:
         """Return the folder of the run's photos; None without one, or if it is not in the folder around the result."""
         recorded = self.summary.settings.images.path
-        return None if recorded is None else input_beside(self.path, recorded)
+        return None if recorded is None else input_beside(self.output_path, recorded)
 
     @property
     def anchors_path(self) -> Path | None:
         """Return the file of the run's anchors; None if it had none."""
         recorded = self.summary.settings.anchors.path
-        return None if recorded is None else path_in(self.path, recorded)
+        return None if recorded is None else path_in(self.output_path, recorded)
 
     def lever_arms_m(self, tag_ids: Sequence[str]) -> Array:
         """Return the lever arm of each tag, (n, 3) metres in the camera frame: its own, else the common one."""
@@ -119,20 +130,20 @@ class ResultFolder:
 
     def read(self, table: type[_Table]) -> _Table:
         """Read one of ``RESULT_TABLES``; without its file it has no rows."""
-        return table.read(self.path)
+        return table.read(self.output_path)
 
     def read_map_errors(self) -> MapErrors:
         """Read how the parts of the refined map err together."""
-        return read_map_errors(self.path)
+        return read_map_errors(self.output_path)
 
     def read_reference(self) -> Reference:
         """Read the reference positions of the photos, in the world of the metric models; empty if there are none."""
-        path = self.path / REFERENCE_NAME
+        path = self.output_path / REFERENCE_NAME
         return read_reference(path) if path.is_file() else NO_REFERENCE
 
     def read_model(self, stage: str) -> pycolmap.Reconstruction | None:
         """Read the model ``stage``/0 ("sparse", "sparse_scaled" or "sparse_metric"); None if it is not there."""
-        path = self.path / stage / "0"
+        path = self.output_path / stage / "0"
         return read_model(path) if path.is_dir() else None
 
     def path_in(self, model: pycolmap.Reconstruction) -> Trajectory:
@@ -141,10 +152,10 @@ class ResultFolder:
         Raises:
             InputError: the result has photo times, but none for a photo of the model.
         """
-        has_table = (self.path / PhotoTimes.NAME).is_file()  # which a result without times does not have
+        has_table = (self.output_path / PhotoTimes.NAME).is_file()  # which a result without times does not have
         path = trajectory_from_reconstruction(model, self.timestamps_s if has_table else None)
         if not len(path) and model.num_reg_images():
-            raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", self.path)
+            raise InputError(f"none of the model's photos has a time in {PhotoTimes.NAME}", self.output_path)
         return path
 
     def read_metric_model(self) -> pycolmap.Reconstruction | None:

@@ -20,7 +20,7 @@ from rangesfm.diagnostics.place import Place
 from rangesfm.errors import number_text
 from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.result import entries
-from rangesfm.result.comparison_row import ComparisonRow
+from rangesfm.result.comparison_row import ComparisonRow, format_table
 from rangesfm.util.files.records import NumberOrNull, Record, Text
 from rangesfm.util.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -104,13 +104,8 @@ class ResultSummary(Record):
         gravity = gravity_of(self.settings.to_json().get("scale", {}).get("up_in_first_camera"))
         return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
-    def lines(self, folder: Path, table: str = "") -> Iterator[str]:
-        """Yield the lines that the user sees at the end of a run.
-
-        Args:
-            folder: of the result.
-            table: of the comparison with a reference, as text.
-        """
+    def lines(self, folder: Path) -> Iterator[str]:
+        """Yield the lines that the user sees at the end of a run; ``folder`` is that of the result."""
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
         interval = "no interval"
         if scale.interval_95 is not None:
@@ -158,8 +153,8 @@ class ResultSummary(Record):
             value, within = _text(offset.value_s, "+.3f"), _text(within_s, ".3f")
             yield f"time offset: image time = range time {value} s, within {within} s (95 %)"
         yield f"map: {self.map.num_photos} photos, {self.map.num_points3D} points, frame {self.frame}"
-        if table:
-            yield from ("", *table.splitlines(), "")
+        if self.comparison:
+            yield from ("", *format_table(self.comparison, self.frame).splitlines(), "")
         yield f"metric model: {folder / ('sparse_scaled/0' if self.refine is None else 'sparse_metric/0')}"
         yield f"all results: {folder / self.NAME}"
 
