@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
-from rangesfm.solver.bending import Bending, bending_part
+from rangesfm.solver.bending import Bending, bending_parts
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component, learnt_sizes, noise_of_sizes
 from rangesfm.solver.posterior import JointProblem, Observations, joined
@@ -33,9 +33,9 @@ class Shaken:
     size: float = 0.3
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
-        found = bending_part("bending", by_pose @ by_pose.T, self.size, 0.0)
+        found = bending_parts("bending", by_pose @ by_pose.T, self.size, 0.0)
         nothing = np.zeros(len(by_pose))
-        return Bending(() if found is None else (found,), np.diag(nothing), nothing)
+        return Bending(found, np.diag(nothing), nothing)
 
 
 def kind(name: str, num: int, seed: int, noise: float, *, is_placed: bool = True, shared: float = 0.0) -> Observations:

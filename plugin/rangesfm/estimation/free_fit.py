@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
-from rangesfm.solver.bending import Bending, bending_part, without_similarity
+from rangesfm.solver.bending import Bending, bending_parts, without_similarity
 from rangesfm.solver.bundle_adjustment import farthest, still_to_come
 from rangesfm.solver.linear_solver import factor, normal_matrix, resized
 from rangesfm.solver.nested_dissection import NestedFactor, SingularError
@@ -147,8 +147,7 @@ class GraphBending:
         parts = functions.reshape(len(by_pose), -1, 6)
         parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
         covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))
-        found = bending_part("bending", covariance, 1.0, 0.0)
-        return Bending(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
+        return Bending(bending_parts("bending", covariance, 1.0, 0.0), covariance, np.zeros(len(by_pose)))
 
     @cached_property
     def _factored(self) -> NestedFactor:

@@ -18,7 +18,7 @@ from rangesfm.solver.bending import (
     FrameSteps,
     MapBending,
     WalkBending,
-    bending_part,
+    bending_parts,
     motions_of_poses,
     similarity_of,
     without_similarity,
@@ -64,9 +64,8 @@ class PhotoBending:
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         gradients = self.shape_by_steps(by_pose, frame_is_free=frame_is_free)
         covariance = gradients.T @ self.photos.solve(gradients)
-        found = bending_part("bending", covariance, MEDIAN_FACTOR, _SPREAD)
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else gradients.T @ self.photos.at_minimum
-        return Bending(() if found is None else (found,), covariance, shift_m)
+        return Bending(bending_parts("bending", covariance, MEDIAN_FACTOR, _SPREAD), covariance, shift_m)
 
     def likely_steps(self, pull: Array, factor: float, *, frame_is_free: bool) -> FrameSteps:
         """Return the steps to where the map is likeliest bent, without a change of its size and its place as a whole.

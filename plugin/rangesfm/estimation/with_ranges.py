@@ -17,7 +17,7 @@ from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.kind import Doubt, MapState
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.points import MapToFit, NamedPoints
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import CLOCK, SHORT, anchors_at
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
@@ -89,12 +89,11 @@ def refine_with_ranges(
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
     markers = tape.control().end_markers
     points = NamedPoints.in_model(metric, markers, ranges.placed_anchors, trajectory.frame_ids)
-    at = MapToFit(points, trajectory, options)
     upward = () if first_pose_is_fixed or gravity is None else (UpwardDirection(gravity),)
     with at_most(num_threads):
         problem = map_problem(
             metric,
-            (*measured_by_radio(ranges, at), *taped_lengths(tape, at), *upward),
+            (*measured_by_radio(ranges, points), *taped_lengths(tape, points), *upward),
             trajectory,
             camera=camera,
             options=options,

@@ -18,7 +18,8 @@ from scipy import special
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.kind import Block, Doubt, Measurements
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import NamedPoints
+from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests
@@ -172,13 +173,15 @@ class KindOnMap(Located):
         """Marks in photos to which they refer in the fit of a map that may bend, by name."""
         return {}
 
-    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+    def measurements(self, on_map: JointMap, points: NamedPoints, options: RefineOptions) -> Iterator[Measurements]:
         """Yield them for the fit of a map that may bend, with the noise to begin with.
 
         Args:
-            on_map: all that is measured in it as one piece. at: the map at the start of the fit.
+            on_map: all that is measured in the unscaled map as one piece.
+            points: of the metric map at the start of the fit, with the poses of its frames, those of the path first.
+            options: of the fit.
         """
-        del on_map, at
+        del on_map, points, options
         yield from ()
 
     # What only kinds have that are solved with unknowns of their own, as ranges with their anchors.

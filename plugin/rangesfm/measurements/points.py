@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -16,11 +15,10 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 from rangesfm.measurements.kind import ByBlock, Linearization, MapState
 from rangesfm.measurements.lengths.tape import Marker
-from rangesfm.options import RefineOptions
 from rangesfm.util.geometry.map_errors import MapPoint, Part
 from rangesfm.util.geometry.poses import frames_in_order, model_poses
 from rangesfm.util.geometry.rotations import cross_matrices
-from rangesfm.util.geometry.trajectory import Trajectory, pose_of
+from rangesfm.util.geometry.trajectory import pose_of
 
 POINT_PREFIX = "point:"
 """Text before the number of a 3-D point of the model, as in ``point:1234``."""
@@ -341,20 +339,6 @@ class NamedPoints:
     @cached_property
     def _index(self) -> dict[int, int]:
         return {frame_id: k for k, frame_id in enumerate(self.frame_ids.tolist())}
-
-
-class MapToFit(NamedTuple):
-    """A metric map at the start of its fit.
-
-    Attributes:
-        points: named ones, with the poses of its frames, those of the trajectory first.
-        trajectory: of the unscaled model, to which the measurements refer.
-        options: of the fit.
-    """
-
-    points: NamedPoints
-    trajectory: Trajectory
-    options: RefineOptions
 
 
 def variance_along(start: Array, end: Array, covariance: Array) -> float:

@@ -100,16 +100,14 @@ class MapBending(Protocol):
         ...
 
 
-def bending_part(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
-    """Return a part in metres with ``factor`` as the median of its size; None if the bins are not affected.
+def bending_parts(name: str, covariance: Array, factor: float, spread: float) -> tuple[Component, ...]:
+    """Return a part in metres with ``factor`` as the median of its size; none if the functions are not affected.
 
     Args:
         covariance: (c, c) for a factor of 1. spread: standard deviation of the logarithm of the factor.
     """
     size_m = float(np.sqrt(np.trace(covariance) / max(len(covariance), 1)))
-    if not size_m > 0:
-        return None
-    return Component(name, covariance / size_m**2, factor * size_m, spread)
+    return (Component(name, covariance / size_m**2, factor * size_m, spread),) if size_m > 0 else ()
 
 
 def without_similarity(by_pose: Array, path: Trajectory, is_firm: Mask, *, frame_is_free: bool) -> Array:
@@ -188,11 +186,11 @@ class WalkBending:
         num = len(by_pose)
         factors = self.factors(by_pose, frame_is_free=frame_is_free)
         shift_m = -np.einsum("csi,si->c", factors, self.steps) if self.is_corrected else np.zeros(num)
-        found = []
+        found = list[Component]()
         for name, median in _OF_PATH.items():
             own = factors[:, :, name == _OF_STEP].reshape(num, -1)
-            found.append(bending_part(name, own @ own.T, median, _SPREAD))
-        return Bending(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
+            found += bending_parts(name, own @ own.T, median, _SPREAD)
+        return Bending(tuple(found), np.zeros((num, num)), shift_m)
 
     def factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         """Return the (c, s, 7) derivatives of c functions of the path by each step; arguments as in of_functions."""

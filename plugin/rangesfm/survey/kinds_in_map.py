@@ -24,7 +24,7 @@ from rangesfm.measurements.lengths.locate_lengths import (
     locate_distances,
     surveyed_distances,
 )
-from rangesfm.measurements.points import MapToFit, NamedPoints
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
@@ -188,8 +188,7 @@ def measured_in_map(
     ranges = replace(found, shared_errors_m=of_log.shared_errors_m)
     markers = tape.end_markers | {name: of for kind in on_map.kinds for name, of in kind.markers.items()}
     points = NamedPoints.in_model(model, markers, ranges.placed_anchors, path.frame_ids)
-    at = MapToFit(points, path, survey.refine)
-    of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, at))
+    of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, points, survey.refine))
     upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
     levelled = () if upward is None else (UpwardDirection(upward),)
-    return (*measured_by_radio(ranges, at), *taped_lengths(tape, at), *of_kinds, *levelled)
+    return (*measured_by_radio(ranges, points), *taped_lengths(tape, points), *of_kinds, *levelled)

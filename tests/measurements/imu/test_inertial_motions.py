@@ -24,7 +24,7 @@ from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, SensorPrior
 from rangesfm.measurements.kind import Measurements
-from rangesfm.measurements.points import MapToFit, NamedPoints
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.poses import Poses
@@ -58,12 +58,12 @@ def drift(made: SyntheticModel) -> tuple[Poses, Poses]:
 
 
 def refined(
-    metric: pycolmap.Reconstruction, path: Trajectory, measured: Callable[[MapToFit], Measurements]
+    metric: pycolmap.Reconstruction, path: Trajectory, measured: Callable[[NamedPoints], Measurements]
 ) -> MapAtRest:
     points = NamedPoints.in_model(metric, {}, first_ids=path.frame_ids)
     problem = map_problem(
         metric,
-        (measured(MapToFit(points, path, RefineOptions())),),
+        (measured(points),),
         path,
         camera=CameraOptions(refine_intrinsics=False),
         options=RefineOptions(),
@@ -93,7 +93,11 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
     state = InertialState.at_rest(gravity, MOUNTING, num)
     covariance = intervals.covariance(np.array([2e-4, 3e-3]))
     problem = InertialProblem(log, path, MOUNTING, PRIOR, WalkBending(path))
-    rest = refined(made.reconstruction, path, lambda at: motions_on_map(problem, state, intervals, covariance, at))
+
+    def measured(points: NamedPoints) -> Measurements:
+        return motions_on_map(problem, state, intervals, covariance, points.state.poses, RefineOptions())
+
+    rest = refined(made.reconstruction, path, measured)
     assert rmse(drifted.centers - true.centers) > 0.1
     assert rest.run.converged
     np.testing.assert_allclose(rest.state.poses.centers, true.centers, atol=1e-6)
@@ -111,7 +115,7 @@ def test_drift_of_scale_and_tilt_is_gone_and_what_is_left_is_as_large_as_said(se
     sensor = scale_by_sensor(InertialProblem(log, path, MOUNTING, PRIOR, WalkBending(path)))
     placed = sensor.alone.estimate
     metric = rescale(made.reconstruction, placed)
-    rest = refined(metric, path, lambda at: next(sensor.measurements(sensor.alone, at)))
+    rest = refined(metric, path, lambda points: next(sensor.measurements(sensor.alone, points, RefineOptions())))
     poses, errors = rest.state.poses, joint_errors(rest, 1.0)
     in_first = (true.centers - true.centers[0]) @ true.world_from_rig[0]
     said_m = float(np.sqrt(np.trace(errors.centers_m2(path.frame_ids), axis1=1, axis2=2).mean()))

@@ -16,7 +16,7 @@ from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_betw
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.scale.range_start import with_lengths
-from rangesfm.solver.bending import Bending, MapBending, bending_part
+from rangesfm.solver.bending import Bending, MapBending, bending_parts
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations
@@ -47,9 +47,9 @@ class Shaken:
     median: float = 0.01
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
-        found = bending_part("bending", by_pose @ by_pose.T, self.median, 0.8)
+        found = bending_parts("bending", by_pose @ by_pose.T, self.median, 0.8)
         nothing = np.zeros(len(by_pose))
-        return Bending(() if found is None else (found,), np.diag(nothing), nothing)
+        return Bending(found, np.diag(nothing), nothing)
 
 
 def located(

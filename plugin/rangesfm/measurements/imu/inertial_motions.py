@@ -24,9 +24,10 @@ from rangesfm.measurements.kind import (
     Measurements,
     Weights,
 )
-from rangesfm.measurements.points import MapToFit
 from rangesfm.measurements.prior import Prior
+from rangesfm.options import RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.poses import Poses
 from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
 from rangesfm.util.geometry.rotations import left_jacobians, logarithms
 
@@ -231,7 +232,12 @@ def _length_and_direction(vector: Array) -> tuple[float, Array]:
 
 
 def motions_on_map(
-    problem: InertialProblem, state: InertialState, intervals: Preintegrated, covariance: Array, at: MapToFit
+    problem: InertialProblem,
+    state: InertialState,
+    intervals: Preintegrated,
+    covariance: Array,
+    poses: Poses,
+    options: RefineOptions,
 ) -> InertialMotions:
     """Return the motions of a log with the noise that they show on a map as it is given, which may bend.
 
@@ -240,6 +246,7 @@ def motions_on_map(
     Args:
         problem: the log on the path. state: to start from, in the metric world.
         intervals: the log summed up between the photos. covariance: (k, 9, 9) of their errors.
+        poses: of the map, in the metric world. options: of the fit.
     """
     photo = intervals.before
     prior, before, now, times_s = problem.prior, problem.mounting, state.mounting, problem.times_s[photo]
@@ -265,9 +272,9 @@ def motions_on_map(
         before,
         prior,
         start,
-        RobustLoss(at.options.range_loss_scale, is_bounded=True),
+        RobustLoss(options.range_loss_scale, is_bounded=True),
     )
-    return motions.with_noise_of(motions.linearize(MapState(at.points.state.poses, start)).residual, 0.0)
+    return motions.with_noise_of(motions.linearize(MapState(poses, start)).residual, 0.0)
 
 
 def velocity_block(photo: int) -> Block:

@@ -37,8 +37,9 @@ from rangesfm.measurements.imu.preintegration import (
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
 from rangesfm.measurements.kind import Doubt, Measurements
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.ranges.errors.components import component_words
+from rangesfm.options import RefineOptions
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.mistakes import MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component
@@ -146,7 +147,7 @@ class InertialScale(KindOnMap):
                 "move it to and fro and turn it about all axes, for half a minute or longer",
             )
 
-    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+    def measurements(self, on_map: JointMap, points: NamedPoints, options: RefineOptions) -> Iterator[Measurements]:
         """Yield the motions between the photos of a map that may bend."""
         state, placed, sizes = self.state, on_map.estimate, on_map.problem.sizes
         in_world = replace(
@@ -157,7 +158,7 @@ class InertialScale(KindOnMap):
         late = sizes["photo_times"] * self.problem.linearized(state, self.intervals).late[..., 0]
         densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
         covariance = self.intervals.covariance(densities) + late @ np.swapaxes(late, 1, 2)
-        yield motions_on_map(self.problem, in_world, self.intervals, covariance, at)
+        yield motions_on_map(self.problem, in_world, self.intervals, covariance, points.state.poses, options)
 
     def entry(self, on_map: JointMap) -> Mapping[str, object]:
         """Return what ``ImuEntry`` has."""

@@ -21,7 +21,7 @@ from rangesfm.measurements.kind import (
     Weights,
 )
 from rangesfm.measurements.lengths.tape import Marker, Tape
-from rangesfm.measurements.points import MapToFit, NamedPoints, images_by_name, variance_along
+from rangesfm.measurements.points import NamedPoints, images_by_name, variance_along
 from rangesfm.measurements.prior import Prior
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss
@@ -168,9 +168,9 @@ def _origin(name: str) -> Block:
     return "rig origin", name
 
 
-def taped_lengths(tape: Tape, at: MapToFit) -> Iterator[Lengths]:
+def taped_lengths(tape: Tape, points: NamedPoints) -> Iterator[Lengths]:
     """Yield the control lengths of a tape whose ends are in a map, if there are any."""
-    taped = [each for each in tape.control().distances if all(name in at.points for name in each.ends)]
+    taped = [each for each in tape.control().distances if all(name in points for name in each.ends)]
     if taped:
         ends, lengths_m = tuple(each.ends for each in taped), np.array([each.distance_m for each in taped])
-        yield Lengths(ends, at.points, lengths_m, np.array([each.stddev_m for each in taped]), {})
+        yield Lengths(ends, points, lengths_m, np.array([each.stddev_m for each in taped]), {})

@@ -21,14 +21,16 @@ from rangesfm.measurements.kind import (
 )
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
-from rangesfm.measurements.points import MapToFit, NamedPoints
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.ranges.errors.noise import STRETCH_S, correlation_inflation, stretch_labels
+from rangesfm.options import RefineOptions
 from rangesfm.solver.bundle_adjustment import BundleAdjustment
 from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -75,29 +77,30 @@ class AntennaPositions(Measurements):
 
     @classmethod
     def on_map(
-        cls, known: KnownPositions, rows: Indices, stddev_m: Array, site_from_model: Similarity, track: AntennaTrack,
-        at: MapToFit,
+        cls, known: KnownPositions, rows: Indices, stddev_m: Array, path: Trajectory, site_from_model: Similarity,
+        track: AntennaTrack, options: RefineOptions,
     ) -> AntennaPositions:  # fmt: skip
         """Return positions on a map that is to be fitted.
 
         Args:
             known: in the unscaled model. rows: (k,) of the antenna's that take part.
-            stddev_m: (k,) standard deviations of a coordinate. site_from_model: the estimate. track: of the antenna.
+            stddev_m: (k,) standard deviations of a coordinate. path: of the unscaled model.
+            site_from_model: the estimate. track: of the antenna. options: of the fit.
         """
         arm_m, of_camera = np.array(track.antenna_in_cam_m, np.float64), known.on_path.subset(rows)
         arms_in_cam_m = np.tile(arm_m, (len(rows), 1))
         stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
         return cls(
             tuple(known.names[row] for row in rows.tolist()),
-            of_camera.on_map(at.trajectory, arms_in_cam_m, known.arms_m[rows], site_from_model),
+            of_camera.on_map(path, arms_in_cam_m, known.arms_m[rows], site_from_model),
             known.position_m[rows],
             _whitenings(known.covariance_m2[rows], stddev_m),
             stated_share=np.nan_to_num(stated_m) / stddev_m,
             group=stretch_labels(known.time_s[rows], STRETCH_S),
             arm_m=arm_m,
-            arm_stddev_m=at.options.lever_arm_stddev_m,
+            arm_stddev_m=options.lever_arm_stddev_m,
             clock_stddev_s=track.offset_stddev_s,
-            loss=RobustLoss(at.options.range_loss_scale, is_bounded=True),
+            loss=RobustLoss(options.range_loss_scale, is_bounded=True),
         )
 
     @property

@@ -16,7 +16,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds, most_contradicting
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import CHECK, LEFT_OUT, Marker
-from rangesfm.measurements.points import MapToFit
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.positions.position_fit import (
@@ -35,7 +35,7 @@ from rangesfm.measurements.positions.position_fit import (
 from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
-from rangesfm.options import LEVER_ARM_M
+from rangesfm.options import LEVER_ARM_M, RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns, EstimatedMistake, noncentrality
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
@@ -260,7 +260,7 @@ class PositionScale(KindOnMap):
         names = (self.known.names[row] for row in np.flatnonzero(self.is_kept & self.known.is_mark).tolist())
         return {name: self.surveyed.points.markers[name] for name in names}
 
-    def measurements(self, on_map: JointMap, at: MapToFit) -> Iterator[Measurements]:
+    def measurements(self, on_map: JointMap, points: NamedPoints, options: RefineOptions) -> Iterator[Measurements]:
         """Yield the control points that take part, and the positions of the antenna.
 
         Outliers of an antenna are left to the loss, because on a map that is one piece drift looks like them.
@@ -269,9 +269,10 @@ class PositionScale(KindOnMap):
         marks, others = (np.flatnonzero(self.is_kept & of_kind) for of_kind in (known.is_mark, ~known.is_mark))
         if len(marks):
             names = tuple(known.names[row] for row in marks.tolist())
-            yield MarkedPositions(names, at.points, known.position_m[marks], stddev_m[marks], {})
+            yield MarkedPositions(names, points, known.position_m[marks], stddev_m[marks], {})
         if track is not None and len(others):
-            yield AntennaPositions.on_map(known, others, stddev_m[others], on_map.estimate, track, at)
+            placed = on_map.path, on_map.estimate
+            yield AntennaPositions.on_map(known, others, stddev_m[others], *placed, track, options)
 
     def grouped(self, on_map: JointMap) -> GroupedPositions:
         """Return the groups of the positions on a map."""

@@ -12,7 +12,7 @@ from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths.cost import Lengths
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.places import AntennaPlaces
-from rangesfm.measurements.points import MapToFit, NamedPoints
+from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
@@ -54,12 +54,12 @@ def ranges_of_map(
     )
 
 
-def measured_by_radio(ranges: Ranges, at: MapToFit) -> Iterator[Measurements]:
+def measured_by_radio(ranges: Ranges, points: NamedPoints) -> Iterator[Measurements]:
     """Yield the ranges of a log to anchors on a metric map, and the lengths between anchors, if there are any."""
     if ranges.takes_part:
-        ranges = ranges.begun(MapState(at.points.state.poses, ranges.blocks))
+        ranges = ranges.begun(MapState(points.state.poses, ranges.blocks))
     yield ranges
-    if len((by_radio := _between_anchors(ranges, at.points)).ends):
+    if len((by_radio := _between_anchors(ranges, points)).ends):
         yield by_radio
 
 
