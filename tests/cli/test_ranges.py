@@ -20,6 +20,7 @@ def test_faults_and_noise_of_a_log_are_said(tmp_path: Path, capsys: pytest.Captu
     text = capsys.readouterr().out
     assert "1 ranges are in the log twice" in text
     assert "1 ranges are earlier than the one before them" in text
+    assert "the log's times go back 1 time by a quarter of its length or more: was its clock restarted?" in text
     assert "all ranges are multiples of 0.01 m" in text
     noise_m = float(text.splitlines()[-1].split()[5])
     assert noise_m == pytest.approx(0.05, rel=0.2)

@@ -264,8 +264,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _notes_of(log: RangeLog) -> list[str]:
-    """Return lines that say what was assumed when the log was read."""
-    return [f"note    {note}" for note in log.notes]
+    """Return lines that say what was assumed when the log was read, and what is odd about its times."""
+    return [f"note    {note}" for note in (*log.notes, *log.notes_on_clock())]
 
 
 def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:

@@ -40,8 +40,6 @@ from rangesfm.util.geometry.reference import NO_REFERENCE, Reference
 _UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
 # Share of neighbouring ranges that are to two other anchors than a given one: a third if three are heard in turn.
 _WITHOUT_ONE = 0.25
-# Times of a log in steps at least as coarse as this get a note.
-_COARSE_STEP_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -436,11 +434,4 @@ def _warnings(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> list[
     notes = [*([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and not survey.tag.tag_id]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
-    if num := log.num_restarts:
-        notes.append(
-            f"the log's times go back {num} time{'s' * (num > 1)} by a quarter of its length or more: was its clock "
-            "restarted?"
-        )
-    if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
-        notes.append(f"the log's times have steps of {step_s:.2g} s: somebody who walks moves that many metres in one")
-    return notes
+    return [*notes, *log.notes_on_clock()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property
@@ -23,6 +23,8 @@ DEFAULT_TAG_ID = "tag"
 _MIN_REPEATED_SHARE = 0.25
 # If more than this share of the steps goes back in time, the log is not in the order of time.
 _MOST_GOING_BACK = 0.05
+# Times of a log in steps at least as coarse as this get a note.
+_COARSE_STEP_S = 0.1
 
 
 class RangeKind(IntEnum):
@@ -146,6 +148,14 @@ class RangeLog:
             return 0
         # Each of the links goes back when the clock does.
         return int(np.bincount(link[steps < -0.25 * np.ptp(self.timestamp_s)], minlength=1).max())
+
+    def notes_on_clock(self) -> Iterator[str]:
+        """Yield lines for the user on times that a clock in order does not give."""
+        if num := self.num_restarts:
+            times = f"{num} time{'s' * (num > 1)}"
+            yield f"the log's times go back {times} by a quarter of its length or more: was its clock restarted?"
+        if (step_s := self.time_resolution_s) >= _COARSE_STEP_S:
+            yield f"the log's times have steps of {step_s:.2g} s: somebody who walks moves that many metres in one"
 
     def _steps_of_links(self, times: Array, order: Indices) -> tuple[Array, Indices]:
         """Return the time steps between successive ranges of the same tag and anchor, with the rows in ``order``.
