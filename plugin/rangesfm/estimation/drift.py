@@ -26,7 +26,7 @@ from rangesfm.estimation.vision_information import (
     steps_of_points,
     vision_information,
 )
-from rangesfm.measurements.kind import Block, MapState
+from rangesfm.measurements.kind import Block, MapState, Measurements
 from rangesfm.solver.bending import FrameSteps
 from rangesfm.solver.bundle_adjustment import farthest
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
@@ -82,7 +82,7 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
 
 
 def close_in_graph(
-    problem: MapProblem, known: MapProblem, rays: Observations, loops: Sequence[Loop]
+    problem: MapProblem, known: Sequence[Measurements], rays: Observations, loops: Sequence[Loop]
 ) -> MapState | None:
     """Close loops of a model that was refined, in place; None where that bends it by no more than photos just see.
 
@@ -90,10 +90,11 @@ def close_in_graph(
     in ``straighten``.
 
     Args:
-        problem, known: with the noise to begin with, and with which the model was refined.
+        problem: with the noise to begin with. known: its measurements with which the model was refined.
         rays: all observations of the photos. loops: of its keyframes.
     """
-    graph = _graph(known, rays, known.start.blocks, loops)
+    refined = problem.like(known)
+    graph = _graph(refined, rays, refined.start.blocks, loops)
     # A bundle adjustment follows in any case. More precisely, the graph takes tens of steps along weak modes.
     fit = solve_graph(graph, graph.start, tolerance_m=problem.visible_m)
     before, after = graph.vision.origin.centers, fit.state.poses.centers

@@ -88,9 +88,9 @@ class MapProblem:
         """Return the (g, d) residuals of each kind."""
         return [kind.linearize(state).residual for kind in self.kinds]
 
-    def like(self, other: MapProblem) -> MapProblem:
-        """Return the problem with the noise of the same measurements in another one."""
-        return self.replaced(lambda k, kind: kind.like(other.kinds[k]))
+    def like(self, kinds: Sequence[Measurements]) -> MapProblem:
+        """Return the problem with the noise that these have, which are the same measurements."""
+        return self.replaced(lambda k, kind: kind.like(kinds[k]))
 
     def with_noise_of(self, state: MapState, num_absorbed: Sequence[float]) -> MapProblem:
         """Return the problem with the noise that the residuals of a state show; arguments as for each kind."""

@@ -24,7 +24,7 @@ from rangesfm.estimation.vision_information import (
     model_observations,
     project,
 )
-from rangesfm.measurements.kind import Block, MapState
+from rangesfm.measurements.kind import Block, MapState, Measurements
 from rangesfm.measurements.marks import add_marks, errors_beyond_features, remove_marks
 from rangesfm.solver.bundle_adjustment import (
     BundleAdjustment,
@@ -118,7 +118,7 @@ def _without_misplaced(problem: MapProblem) -> tuple[MapProblem, BundleAdjustmen
 
 def refine_with_loops(
     problem: MapProblem,
-    known: MapProblem,
+    known: Sequence[Measurements],
     loops: Sequence[Loop],
     merge_tracks: Callable[[pycolmap.Reconstruction], None],
     *,
@@ -127,13 +127,13 @@ def refine_with_loops(
     """Move a refined model so that its loops close, in place, and refine it again; None where they are closed already.
 
     Args:
-        problem, known: with the noise to begin with, and with which the model was refined.
+        problem: with the noise to begin with. known: its measurements with which the model was refined.
         loops: of its keyframes.
         merge_tracks: makes one point of those that two passes saw apart, in place.
         with_equations: as for ``refine``.
     """
     seen, _, rays = _without_misplaced(problem)
-    if (closed := close_in_graph(seen, seen.like(known), rays, loops)) is None:
+    if (closed := close_in_graph(seen, known, rays, loops)) is None:
         return None
     merge_tracks(problem.metric)
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do

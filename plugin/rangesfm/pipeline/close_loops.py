@@ -201,7 +201,7 @@ def _closed_by_photos(
 
     def close(before: LoopFinder, loops: Sequence[Loop], is_last: bool) -> tuple[LoopFinder, Sequence[str]] | None:
         problem = _problem(survey, path, before.model, is_refined=True)
-        rest = refine_with_loops(problem, problem, loops, matching.merge_tracks, with_equations=not is_last)
+        rest = refine_with_loops(problem, (), loops, matching.merge_tracks, with_equations=not is_last)
         if rest is None:
             return None
         errors = point_errors(rest.problem.metric)

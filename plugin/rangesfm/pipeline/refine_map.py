@@ -60,9 +60,7 @@ def refine_closed_map(
     run = _with_open_clock(run, metric)
     assert metric.kept is not None, "a refined map"
     with at_most(run.survey.mapper.num_threads):
-        problem = _problem(run, metric, is_refined=True)
-        known = problem.like(replace(problem, kinds=metric.kept.kinds))
-        rest = refine_with_loops(problem, known, loops, merge_tracks)
+        rest = refine_with_loops(_problem(run, metric, is_refined=True), metric.kept.kinds, loops, merge_tracks)
         return None if rest is None else _finished(run, metric, rest)
 
 

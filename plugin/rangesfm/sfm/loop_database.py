@@ -97,11 +97,6 @@ class LoopMatching(Workspace):
                     return f"{image.name} has no descriptors in the database"
         return None
 
-    @property
-    def seed(self) -> int:
-        """Seed of random numbers."""
-        return self.options.seed
-
     def known(self) -> dict[int, set[int]]:
         """Return the photos that each photo was matched with by the mapping or tied with, by its id."""
         known: dict[int, set[int]] = defaultdict(set)
@@ -130,8 +125,9 @@ class LoopMatching(Workspace):
 
         Poses and cameras stay. The ids of photos and features are those of the database.
         """
-        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=self.seed)
-        options.triangulation.random_seed = options.mapper.random_seed = self.seed
+        seed = self.options.seed
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed)
+        options.triangulation.random_seed = options.mapper.random_seed = seed
         triangulation = options.get_triangulation()
         with colmap_log(self.log):
             with pycolmap.Database.open(self.database) as database:

@@ -66,7 +66,7 @@ def find_loops(
             that look alike are tried, too, unless the map predicts that they see the same; of photos that were matched
             with each other only one.
     """
-    known = matching.known()
+    known, seed = matching.known(), matching.options.seed
     matched = {id_: set(others) for id_, others in known.items()}
     for first, second in tried.proposed:
         matched.setdefault(first, set()).add(second)
@@ -84,14 +84,14 @@ def find_loops(
     more = {pair for photo, of_photo in choices.items() if photo not in tied for pair in of_photo}
     if by_likeness and not tried.proposed:
         told, predicted = set[int](), finder.predicted(matched)
-        for first, second in pairs_alike(matching.database, predicted, matching.log, max_num=1, seed=matching.seed):
+        for first, second in pairs_alike(matching.database, predicted, matching.log, max_num=1, seed=seed):
             if first not in told:
                 more.add((first, second))
                 told.update((first, *known.get(first, ())))
     if more := more - proposed:
         verified = {**verified, **matching.match(sorted(more))}
         proposed |= more
-    loops, contradicted = finder.tested(verified, seed=matching.seed)
+    loops, contradicted = finder.tested(verified, seed=seed)
     return loops, replace(
         tried,
         proposed=tried.proposed.union(proposed),
