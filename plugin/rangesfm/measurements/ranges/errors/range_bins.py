@@ -69,21 +69,6 @@ class RangeBins:
         means = self.averages @ by_range
         return np.pad(means.toarray(), ((0, 0), (0, 6 * num_poses - means.shape[1])))
 
-    def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
-        """Return the covariance (c, c), square metres, of the bins due to uncertain positions of the antenna.
-
-        Ranges from one gap between keyframes share one position error, a vector; errors of different gaps are
-        independent.
-
-        Args:
-            towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) standard deviation of each coordinate.
-            gap: (n,) index of each range's gap.
-        """
-        num, column = len(gap), 3 * gap[:, None] + np.arange(3)
-        by_place = csr_array(((placing_m[:, None] * towards).ravel(), column.ravel(), 3 * np.arange(num + 1)))
-        of_bins = self.averages @ by_place
-        return np.asarray((of_bins @ of_bins.T).toarray())
-
     def total(self, values: Array) -> Array:
         """Return the (c,) sums of (n,) values of the ranges."""
         return np.bincount(self.of_range, values, len(self)).astype(np.float64)

@@ -81,7 +81,7 @@ def moved(on_map: RangesOnMap, known: Posterior) -> RangesOnMap:
     """
     problem, before, columns = on_map.weighted.without_others(), on_map.state, known.columns
     problem = replace(problem, bias_stddev_m=np.zeros(problem.num_anchors))
-    slopes = prior_jacobian(problem, columns, before, before)
+    slopes = prior_jacobian(problem, columns, before)
     state = state_after((columns,), before, known.step)
     linear = prior_residuals(problem, columns, before) + slopes @ known.step
     again = known.covariance @ slopes.T @ (linear - prior_residuals(problem, columns, state))

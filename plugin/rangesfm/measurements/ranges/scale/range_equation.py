@@ -32,6 +32,7 @@ from rangesfm.util.geometry.rotations import left_jacobians
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 
 _MAX_NUM_EVALUATIONS = 100
+_BY_TURN = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -335,9 +336,16 @@ class _System:
         return np.concatenate(ranges), prior_residuals(self.parts[0], self.columns[0], state)
 
     def jacobian(self, state: RangeState) -> tuple[Array, Array]:
-        """Return the Jacobians of the residuals of ranges and of priors."""
-        of_parts = zip(self.parts, self.columns, self.start.of_models, state.of_models, strict=True)
-        priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
+        """Return the Jacobians of the residuals of ranges and of priors by a parameter vector, which is 0 at the start.
+
+        A rotation vector acts on the left of the start's rotation, so away from zero its derivative needs the left
+        Jacobian of SO(3).
+        """
+        both = zip(self.start.similarities, state.similarities, strict=True)
+        turned = [Rotation.from_matrix(now.rotation @ before.rotation.T).as_rotvec() for before, now in both]
+        by_turns = [left_jacobians(each) for each in turned]
+        of_parts = zip(self.parts, self.columns, state.of_models, by_turns, strict=True)
+        priors = prior_jacobian(self.parts[0], self.columns[0], state, by_turns[0])
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
 
     def slope(self, state: RangeState) -> tuple[Array, Array]:
@@ -389,8 +397,12 @@ def _moved(similarity: Similarity, columns: Columns, x: Array) -> Similarity:
     return Similarity(scale, rotation, similarity.translation + shift)
 
 
-def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
-    """Return the (n, p) Jacobian of the residuals of one model's ranges, in standard deviations."""
+def range_jacobian(problem: RangeProblem, columns: Columns, state: RangeState, by_turn: Array = _BY_TURN) -> Array:
+    """Return the (n, p) Jacobian of the residuals of one model's ranges, in standard deviations.
+
+    Args:
+        by_turn: (3, 3) derivatives of a turn of the world by the rotation vector among the parameters.
+    """
     similarity, index = state.metric_from_model, problem.anchor_index
     grown = similarity.scale * problem.centers @ similarity.rotation.T
     by = range_gradient(problem, state)
@@ -398,7 +410,7 @@ def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
     jacobian[:, columns.scale] = by.by_log_scale(grown)
     if columns.frame >= 0:
         arms = grown + problem.tag_from_center @ similarity.rotation.T
-        jacobian[:, columns.frame : columns.frame + 3] = by.by_turn_of_world(arms) @ _left_of_step(start, state)
+        jacobian[:, columns.frame : columns.frame + 3] = by.by_turn_of_world(arms) @ by_turn
         jacobian[:, columns.frame + 3 : columns.frame + 6] = by.by_tag
     rows = np.flatnonzero(columns.anchor[index] >= 0)
     jacobian[rows[:, None], columns.anchor[index[rows], None] + np.arange(3)] = by.by_anchor[rows]
@@ -406,15 +418,6 @@ def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
     jacobian[rows, columns.bias[index[rows]]] = 1.0
     jacobian /= problem.stddev_m[:, None]
     return jacobian
-
-
-def _left_of_step(start: RangeState, state: RangeState) -> Array:
-    """Return the left Jacobian of SO(3) at the rotation from start to state.
-
-    The rotation vector acts on the left of the start's rotation, so away from zero its derivative needs this factor.
-    """
-    turned = Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T)
-    return left_jacobians(turned.as_rotvec())
 
 
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
@@ -438,8 +441,8 @@ def prior_cost(problem: RangeProblem, state: RangeState) -> float:
     return 0.5 * float(off @ off)
 
 
-def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
-    """Return the (r, p) Jacobian of ``prior_residuals``."""
+def prior_jacobian(problem: RangeProblem, columns: Columns, state: RangeState, by_turn: Array = _BY_TURN) -> Array:
+    """Return the (r, p) Jacobian of ``prior_residuals``; arguments as of ``range_jacobian``."""
     anchors, biases = problem.uncertain
     known, axis = np.nonzero(~np.isnan(problem.anchor_mean_m[anchors]))
     jacobian = np.zeros((len(known) + len(biases), columns.num))
@@ -451,11 +454,11 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
     blocks = [jacobian, of_distances]
     if problem.gravity is not None and columns.frame >= 0:
         block = np.zeros((3, columns.num))
-        turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))
+        turn = problem.gravity.jacobian(similarity.rotation, by_turn)
         block[:, columns.frame : columns.frame + 3] = turn
         blocks.append(block)
     if problem.placement is not None and columns.frame >= 0:
         block = np.zeros((7, columns.num))
-        block[:, columns.of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
+        block[:, columns.of_map] = problem.placement.jacobian(similarity, by_turn)
         blocks.append(block)
     return np.concatenate(blocks)

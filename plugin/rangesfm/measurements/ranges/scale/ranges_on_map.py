@@ -165,9 +165,9 @@ class RangesOnMap:
         columns, state = columns_of([problem])[0], self.state
         return LinearMap(
             residual_m=bins.mean(self.residual_m),
-            design=bins.mean(range_jacobian(problem, columns, state, state)),
+            design=bins.mean(range_jacobian(problem, columns, state)),
             prior_residual=prior_residuals(problem, columns, state),
-            prior_design=prior_jacobian(problem, columns, state, state),
+            prior_design=prior_jacobian(problem, columns, state),
             columns=columns,
         )
 
@@ -179,7 +179,11 @@ class RangesOnMap:
         """
         placing_m, known_m2 = self.posed.placing_stddev_m(self.state.metric_from_model.scale), dict[OtherError, Array]()
         if np.any(placing_m > 0):
-            known_m2[PLACES] = bins.shared_by_places(self.gradient.by_tag, placing_m, self.posed.on_path.before)
+            # Ranges in one gap between keyframes share the error of a place; errors of different gaps are independent.
+            num, column = len(placing_m), 3 * self.posed.on_path.before[:, None] + np.arange(3)
+            towards = placing_m[:, None] * self.gradient.by_tag
+            of_bins = bins.averages @ csr_array((towards.ravel(), column.ravel(), 3 * np.arange(num + 1)))
+            known_m2[PLACES] = (of_bins @ of_bins.T).toarray()
         stddevs = {"bias": float(self.problem.bias_stddev_m.max()), "common_bias": self.problem.common_bias_stddev_m}
         ruled_out = [name for name, stddev in stddevs.items() if stddev == 0]
         return radio_components(bins, self.posed.curve_stddev_m, ruled_out, known_m2 | {**others_m2})
