@@ -14,7 +14,7 @@ from rangesfm.diagnostics.lens import doubts_of_lens
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.scale.scale_estimate import refuse_unknown
-from rangesfm.measurements.joint_map import JointMap
+from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
@@ -67,11 +67,18 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
 
 
 def _tested(run: SurveyRun, metric: MetricResult) -> Diagnosis:
-    """Return the tests of all kinds, first of those that place the map."""
-    on_map, diagnosis = metric.all_measured, Diagnosis()
-    for each in sorted(on_map.kinds, key=lambda each: not each.places_map):
+    """Return the tests of all kinds, first of those that contradict others, and then of those that place the map.
+
+    On a map by the one of two kinds that is wrong, the other seems to have mistakes that nobody made.
+    """
+    on_map, by_kind, diagnosis = metric.all_measured, metric.estimate.by_kind, Diagnosis()
+
+    def comes_later(kind: KindOnMap) -> tuple[bool, bool]:
+        return not any(row.rejected for row in kind.against_others(on_map, by_kind)), not kind.places_map
+
+    for each in sorted(on_map.kinds, key=comes_later):
         try:
-            diagnosis = diagnosis.with_more(each.tests(on_map, metric.estimate.by_kind))
+            diagnosis = diagnosis.with_more(each.tests(on_map, by_kind))
         except np.linalg.LinAlgError as error:
             run.journal.warn(f"mistakes were not tested, because the {each.words} determine too little: {error}")
     return diagnosis

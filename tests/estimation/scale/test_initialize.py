@@ -409,6 +409,14 @@ def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wr
     assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
 
 
+def test_lengths_in_feet_do_not_mislead_the_scale_by_the_ranges_alone(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE)
+    found = survey.scale("unknown", distances=between_cameras(survey, factor=1 / 0.3048))
+    alone = survey.scale("unknown")
+    assert found.by_kind["lengths"].value == pytest.approx(alone.value / 0.3048, rel=0.02)
+    assert found.by_kind["ranges"] == alone.on_map.scale
+
+
 def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE)
     log = survey.log_with(survey.log.range_m + 0.3)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_kinds
 from rangesfm.measurements.kind import Block, Doubt
 from rangesfm.measurements.ranges.errors.components import CLOCKS
@@ -92,7 +93,7 @@ class RangeScale(KindOnMap):
 
     @cached_property
     def alone(self) -> JointMap:
-        """The map by the ranges alone, solved again from here."""
+        """The map by the ranges alone, solved anew; from here, if they alone leave it open."""
         own = replace(self, solved=self._without_others)
         return join_kinds((own,), self.path, own.start, self.solved.bending)
 
@@ -101,7 +102,11 @@ class RangeScale(KindOnMap):
         problem = self.solved.problem
         if problem.placement is None and not problem.distances.is_between_points.any():
             return self.solved
-        is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
+        # Others that are wrong may have led the ranges to where they no longer find back.
+        try:
+            return self.solved.posed.given.beside(()).solved
+        except GeometryError:
+            is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
         return self.solved.solved(lambda problem: replace(problem.without_others(), frame_is_free=is_free))
 
     def with_their_share(self) -> RangeScale:
