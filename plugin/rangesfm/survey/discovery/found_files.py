@@ -79,7 +79,7 @@ _TABLES: dict[str, Callable[[str], bool]] = {
 # Lists in tables of any layout: how their columns are found, and how they are read.
 _LISTS: dict[str, tuple[Callable[[Path, Layout], object], Callable[[Path], object]]] = {
     ANCHORS: (partial(anchor_file.find_points, anchor_file.ANCHORS), anchor_file.read_anchor_list),
-    TIMES: (photo_list.PHOTO_TIMES.find_columns, photo_list.read_photo_list),
+    TIMES: (partial(photo_list.find_photo_columns, photo_list.PHOTO_TIMES), photo_list.read_photo_list),
 }
 _KEY_OF_LIST = {"anchors": ANCHORS, "positions": POSITIONS, "photo times": TIMES}
 

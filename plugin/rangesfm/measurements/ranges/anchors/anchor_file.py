@@ -99,7 +99,7 @@ def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
 
 
 def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
-    """Return the name of the column of each of QUANTITIES; None if the table is not one of points.
+    """Return the name of the column of each quantity; None if the table is not one of points.
 
     Args:
         form: the kind of points, such as ANCHORS.
@@ -107,8 +107,9 @@ def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] |
     Raises:
         UnclearFileError: it may be one, but the columns are not known for sure.
     """
-    found = _by_name(layout) if layout.has_names else _by_values(layout)
-    ids, axes = found["anchor_id"], {axis: found[axis] for axis in AXES}
+    by_quantity = _by_name(layout) if layout.has_names else _by_values(layout)
+    found = {form.own.get(quantity, quantity): those for quantity, those in by_quantity.items()}
+    ids, axes = found[form.required[0]], {axis: found[axis] for axis in AXES}
     degrees = {} if axes["x"] and axes["y"] else _degrees(layout)
     is_about_anchors = not terms.ABOUT_ANCHORS.isdisjoint(terms.words_of(path.stem))
     is_named = layout.has_names and any((terms.ANCHOR | terms.POINT) & {*column.words} for column in ids)
@@ -120,9 +121,9 @@ def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] |
         may_be or (is_about_anchors and any(column.kind == "numbers" for column in layout.columns))
     ):
         return None
-    columns = {quantity: those[0].name for quantity, those in found.items() if those}
+    columns = {quantity: those[0].name for quantity, those in found.items() if those and quantity in form.names}
     doubts, choices = [], list[Choice]()
-    for quantity, what in (("anchor_id", "the anchor's id"), ("x", "x"), ("y", "y"), ("z", "z (height)")):
+    for quantity, what in zip(form.required, ("the anchor's id", "x", "y", "z (height)")):
         several = found[quantity]
         if len(several) > 1:
             doubts.append(f"any of {names_of(several)} may be {what}")
@@ -141,7 +142,7 @@ def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] |
         return columns
     if not choices and not degrees:
         choices = [*_ways_to_complete(form, layout, columns)]
-    unknown = {quantity: "NAME" for quantity in ("anchor_id", *AXES) if quantity not in columns | degrees}
+    unknown = {quantity: "NAME" for quantity in form.required if quantity not in columns | degrees}
     choices = choices or [form.choice("with the names of the columns", columns | degrees | unknown)]
     raise unclear_table(form.what, path, layout, doubts, choices)
 
@@ -176,7 +177,7 @@ def like_points(form: TableForm, path: Path) -> UnclearFileError | None:
         return None
     ways = [dict(zip(AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
     choices = [
-        form.choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
+        form.choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {form.required[0]: first.name, **way})
         for way in ways
     ]
     return unclear_table(form.what, path, layout, ["the names of the columns are not known"], choices)
@@ -186,8 +187,8 @@ def _ways_to_complete(form: TableForm, layout: Layout, columns: Mapping[str, str
     """Yield the ways to give each quantity that has no column yet one that may hold it, by its values."""
     free = [column for column in layout.columns if column.name not in columns.values()]
     may_be = {quantity: [one.name for one in free if one.kind == "numbers"] for quantity in AXES}
-    may_be["anchor_id"] = [one.name for one in free if one.num_distinct == len(one.cells) and _may_be_id(one)]
-    missing = [quantity for quantity in ("anchor_id", *AXES) if quantity not in columns]
+    may_be[form.required[0]] = [one.name for one in free if one.num_distinct == len(one.cells) and _may_be_id(one)]
+    missing = [quantity for quantity in form.required if quantity not in columns]
     ways = [way for way in product(*(may_be[quantity] for quantity in missing)) if len({*way}) == len(way)]
     for way in ways if missing and len(ways) <= _MAX_NUM_WAYS else ():
         when = " and ".join(f"{name} is {quantity}" for quantity, name in zip(missing, way))

@@ -71,7 +71,7 @@ class TableForm:
         flag: by which the user gives the columns; empty if one cannot.
         also: quantities that only other tables have.
         aliases: other names of columns in the canonical CSV, as for ``read_table``.
-        own: quantities that ``find`` calls otherwise, by its names.
+        own: names here of quantities that have other ones in similar lists, by these.
     """
 
     what: str
@@ -96,18 +96,9 @@ class TableForm:
 
     def choice(self, when: str, columns: Mapping[str, str], **flags: str) -> Choice:
         """Return a way to read a table, by the columns of quantities and other flags for the same table."""
-        columns, table = self._by_own_names(columns), self.flag.removesuffix("columns")
+        table = self.flag.removesuffix("columns")
         typed = {quantity: columns[quantity] for quantity in self.quantities if quantity in columns}
         return Choice(when, {self.flag: columns_typed(typed), **{table + flag: value for flag, value in flags.items()}})
-
-    def find_columns(self, path: Path, layout: Layout) -> Mapping[str, str] | None:
-        """Return the name of the column of each quantity, None if the file is no such table; errors as of ``find``."""
-        found = self.find(self, path, layout)
-        return None if found is None else self._by_own_names(found)
-
-    def _by_own_names(self, columns: Mapping[str, str]) -> dict[str, str]:
-        named = {self.own.get(quantity, quantity): name for quantity, name in columns.items()}
-        return {quantity: name for quantity, name in named.items() if quantity in self.quantities}
 
     @property
     def expected(self) -> str:
@@ -129,7 +120,7 @@ class TableForm:
         if layout is None:
             return self.is_canonical(read_head(path))
         try:
-            return layout.has_names and self.find_columns(path, layout) is not None
+            return layout.has_names and self.find(self, path, layout) is not None
         except InputError:
             return False
 
@@ -161,7 +152,7 @@ class TableForm:
         if layout is None:
             found = f"no table of {self.what}" if read_head(path).strip() else "the file is empty"
             raise InputError(f"{found}, {self.expected}", path)
-        taken = self._columns_by_user(columns, layout, path) if columns else self.find_columns(path, layout)
+        taken = self._columns_by_user(columns, layout, path) if columns else self.find(self, path, layout)
         if taken is None:
             found = printable(", ".join(layout.names))
             raise InputError(f"no columns of {self.what}; found {found}; {self.expected}", path)
