@@ -68,21 +68,15 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
     if not ranges:
         return NO_RANGES
-    before, after, has_place = ranges.places_on(metric_path.image_names)
+    _, _, has_place = ranges.places_on(metric_path.image_names)
     rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
-    # Times of the ranges by the clock of the camera, or names of photos where these have no times.
-    times, names = np.zeros(0), list[str]()
-    if metric_path.timestamps_s is None:
-        names = [metric_path.image_names[row] for row in before[rows]]
-    else:
-        fraction, known = ranges.weight[rows], metric_path.timestamps_s
-        times = (1 - fraction) * known[before[rows]] + fraction * known[after[rows]]
+    has_times = metric_path.timestamps_s is not None
     tag_ids = [ranges.tag_id[row] for row in rows]
     log = RangeLog.from_arrays(
         [ranges.anchor_id[row] for row in rows],
         ranges.range_m[rows],
-        timestamp_s=times,
-        image_name=names,
+        timestamp_s=ranges.camera_times_s(result.timestamps_s)[rows] if has_times else (),
+        image_name=() if has_times else [ranges.keyframe_before[row] for row in rows],
         tag_id=tag_ids,
         source=result.output_path / RangesAsUsed.NAME,
     )

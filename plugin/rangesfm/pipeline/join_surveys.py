@@ -202,19 +202,11 @@ def _rows_to_join(ranges: RangesAsUsed, use_anchors: Sequence[str]) -> list[int]
 def _camera_times_s(survey: FinishedRun) -> Array:
     """Return the time of each range on the camera's clock, (n,) seconds.
 
-    It is interpolated between the times of the photos around the range. For ranges without a place on the path, it
-    follows from the time offset.
+    For ranges without a place on the path, it follows from the time offset.
     """
-    ranges, times = survey.ranges, survey.result.timestamps_s
-    if not times:
-        return np.full(len(ranges.range_m), np.nan)
-    offset = survey.result.summary.time_offset.value_s or 0.0
-    before, after = (
-        np.array([times.get(name, np.nan) for name in names], dtype=np.float64)
-        for names in (ranges.keyframe_before, ranges.keyframe_after)
-    )
-    at_place = (1 - ranges.weight) * before + ranges.weight * after
-    return np.where(np.isfinite(at_place), at_place, ranges.timestamp_s + offset)
+    at_place_s = survey.ranges.camera_times_s(survey.result.timestamps_s)
+    offset_s = survey.result.summary.time_offset.value_s or 0.0
+    return np.where(np.isfinite(at_place_s), at_place_s, survey.ranges.timestamp_s + offset_s)
 
 
 def paths_of_surveys(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -140,6 +140,18 @@ class RangesAsUsed(TableFile):
             for names in (self.keyframe_before, self.keyframe_after)
         )
         return before, after, (before >= 0) & (after >= 0) & np.isfinite(self.weight)
+
+    def camera_times_s(self, photos_s: Mapping[str, float]) -> Array:
+        """Return the time of each range on the camera's clock, (n,) seconds; NaN without a place.
+
+        Args:
+            photos_s: times of the photos by name, between which the times of the ranges are interpolated.
+        """
+        before, after = (
+            np.array([photos_s.get(name, np.nan) for name in names], dtype=np.float64)
+            for names in (self.keyframe_before, self.keyframe_after)
+        )
+        return np.asarray((1 - self.weight) * before + self.weight * after)
 
     @property
     def residuals_by_model_m(self) -> dict[str, Array]:
