@@ -30,7 +30,6 @@ from rangesfm.options import LENGTH_M
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.mistakes import MistakeTest
-from rangesfm.solver.posterior import joined
 from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import first_camera_from
 
@@ -140,8 +139,7 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     if ranges is None:
         return ()
     here, bins = ranges.solved, bins_on(on_map)
-    joint = joined([in_bins(here, bins, here.noise_stddev_m, {}, np.zeros(len(bins)))], here.bending)
-    problem = Linearized(**vars(joint), on_map=here, bins=bins, scatter_m=0.0)
+    problem = Linearized.by_ranges(in_bins(here, bins, here.noise_stddev_m, {}, np.zeros(len(bins))), here, 0.0)
     found = []
     for test in Factorization(problem).estimates([each for of_kind in STANDING for each in of_kind(problem)]):
         row = row_of(test)

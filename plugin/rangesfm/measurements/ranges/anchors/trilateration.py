@@ -40,7 +40,6 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.solver.linear_map import Solved
 from rangesfm.solver.noise import Component
-from rangesfm.solver.posterior import joined
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP, SAME_COST
@@ -314,8 +313,7 @@ def _in_bins(on_map: RangesOnMap) -> Linearized:
     index = observed.bins.anchor_index
     own_bias = Component("bias", (index[:, None] == index).astype(np.float64), bias_stddev_m)
     others = (each for each in observed.components if each.name not in ("bias", "common_bias"))
-    problem = joined([replace(observed, components=(*others, own_bias))], on_map.bending)
-    return Linearized(**vars(problem), on_map=on_map, bins=observed.bins, scatter_m=on_map.noise_stddev_m)
+    return Linearized.by_ranges(replace(observed, components=(*others, own_bias)), on_map, on_map.noise_stddev_m)
 
 
 def _concluded(

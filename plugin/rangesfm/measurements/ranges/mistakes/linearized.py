@@ -14,7 +14,7 @@ from rangesfm.measurements.ranges.errors.components import DRIFT_S, WANDERING
 from rangesfm.measurements.ranges.errors.learned import is_widened, widening
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins, noisiness
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
+from rangesfm.measurements.ranges.scale.binned_ranges import BinnedRanges, in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, state_after
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.posterior import JointProblem, joined
@@ -53,6 +53,12 @@ class Linearized(JointProblem):
     on_map: RangesOnMap
     bins: RangeBins
     scatter_m: float
+
+    @classmethod
+    def by_ranges(cls, observed: BinnedRanges, on_map: RangesOnMap, scatter_m: float) -> Linearized:
+        """Return the problem of ranges that were averaged on a map, with the usual sizes of their errors."""
+        problem = joined([observed], on_map.bending)
+        return cls(**vars(problem), on_map=on_map, bins=observed.bins, scatter_m=scatter_m)
 
     @cached_property
     def time_s(self) -> Array:
@@ -172,8 +178,8 @@ def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -
     alone_m2 = scatter_m**2 / np.maximum(bins.worth, 1e-12)
     together = np.exp(-np.abs(bins.time_s[:, None] - bins.time_s) / DRIFT_S)
     wandering_m2 = _WANDERING_M**2 * (1.0 + (bins.anchor_index[:, None] == bins.anchor_index)) * together
-    problem = joined([in_bins(on_map, bins, scatter_m, {WANDERING: wandering_m2}, alone_m2)], on_map.bending)
-    return Linearized(**vars(problem), on_map=on_map, bins=bins, scatter_m=scatter_m).with_usual_errors()
+    observed = in_bins(on_map, bins, scatter_m, {WANDERING: wandering_m2}, alone_m2)
+    return Linearized.by_ranges(observed, on_map, scatter_m).with_usual_errors()
 
 
 def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> bool:

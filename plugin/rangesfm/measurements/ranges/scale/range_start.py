@@ -12,7 +12,7 @@ from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.cost import Ranges, anchors_at
+from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
@@ -121,12 +121,9 @@ class RangesAtRest(Located):
         turns, velocity = turns_and_velocities(posed.observations, posed.rows, trajectory)
         given = replace(posed.given, trajectory=trajectory, bending=self.bending)
         posed = replace(posed, given=given, ranges=problem, model_from_cam=turns, velocity=velocity)
-        anchors = anchors_at(ranges.anchors, self.state.blocks)
-        state = RangeState(
-            placed,
-            np.array([anchor.position_m for anchor in anchors]),
-            np.array([anchor.range_bias_m for anchor in anchors]),
-        )
+        ids, blocks = posed.observations.log.anchor_ids, self.state.blocks
+        anchors_m, biases_m = np.array([blocks["anchor", id_] for id_ in ids]), [blocks["bias", id_][0] for id_ in ids]
+        state = RangeState(placed, anchors_m, np.array(biases_m))
         weighted, errors = posed.weighted(ranges.errors), ranges.errors
         off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
         fit, noise_m = fit_at(weighted, state, errors.robust_weights(off_m)), float(np.median(errors.stddev_m))
