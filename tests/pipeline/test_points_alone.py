@@ -235,6 +235,14 @@ def test_points_that_are_too_few_are_refused_with_their_number(yard: Yard, tmp_p
         scale_model(survey, progress=QUIET)
 
 
+def test_check_points_and_lengths_alone_are_no_measurements_of_a_map(yard: Yard, tmp_path: Path) -> None:
+    (tmp_path / "tape.csv").write_text("from,to,distance_m,kind\nM0,M1,2.5,check\n")
+    tape = {"scale__distances": tmp_path / "tape.csv"}
+    for more in ({}, tape):
+        with pytest.raises(GeometryError, match="nothing in the map is measured but for comparison, as check points"):
+            scale_model(yard.survey(tmp_path, yard.rows(["check"] * 4), **more), progress=QUIET)
+
+
 def test_a_point_without_marks_is_named_and_left_out(yard: Yard, tmp_path: Path) -> None:
     survey = yard.survey(tmp_path, yard.rows(["control"] * 4) + "unseen,1,2,3,0.01,control\n", report__enabled=False)
     summary = scale_model(survey, progress=QUIET).summary

@@ -147,9 +147,8 @@ class SurveyRun:
         log = path.observations
         at = MapOfPhotos(path.sfm, path.trajectory, bending, self.survey, log)
         located, remarks = kinds_in_map(self.inputs, at)
-        if not located:
-            why = remarks or ("nothing that was measured is in the map",)
-            raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
+        if not located and remarks:
+            raise GeometryError(f"the scale is not determined: {'; '.join(remarks)}")
         begun = RangeEstimate.begun(log, self.survey.ranges)
         return estimate_scale(located, path.trajectory, bending, self.survey.scale, begun).remarked(remarks)
 

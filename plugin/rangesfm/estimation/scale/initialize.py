@@ -133,7 +133,8 @@ def _started(
         kinds = beside_others(located, others)
         used = [each for each in kinds if each.is_used]
         if not used:
-            why = [note for each in kinds for note in each.notes] or ["nothing that was measured is in the map"]
+            nothing = "nothing in the map is measured but for comparison, as check points and check lengths are"
+            why = [note for each in kinds for note in each.notes] or [nothing]
             raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
         # One kind that gives both the map's scale and its place is no scale beside others.
         is_all = len(used) == 1 and (used[0].places_map or used[0].is_solved)
