@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Mask, median, rms
+from rangesfm.arrays import Mask, median, rms
 from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.errors import number_text
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
@@ -23,7 +23,6 @@ from rangesfm.measurements.positions.control_points import locate_points
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
 from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
-from rangesfm.measurements.ranges.scale.two_candidate import two_candidate
 from rangesfm.pipeline.metric_result import MetricResult, ModelVerdict
 from rangesfm.result import entries
 from rangesfm.result.result_tables import (
@@ -304,18 +303,12 @@ def _tables_of_scale(estimate: ScaleEstimate, path: Trajectory) -> Iterator[Tabl
     anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
     rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
     tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
-
-    def about(held: Array) -> tuple[Array, Array]:
-        """Return centres in SfM units and anchors in metres, both along the metric axes and relative to a place."""
-        return (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
-
-    # In the paper the first camera is the origin.
-    centers, anchor_m = about(path.centers[0])
-    table = two_candidate(centers, tags, anchor_m, range_m)
-    seen, duplets = (rows[:0], np.zeros((0, 2))) if table is None else (rows[table.rows], table.duplets)
+    table = estimate.two_candidate
+    seen, duplets = (rows[:0], np.zeros((0, 2))) if table is None else (table.rows, table.duplets)
     yield ScaleCandidates(log.timestamp_s[seen], tuple(log.anchor_ids[k] for k in log.anchor_index[seen]), *duplets.T)
     # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
-    centers, anchor_m = about(path.centers.mean(axis=0) if estimate.frame == "site" else path.centers[0])
+    held = path.centers.mean(axis=0) if estimate.frame == "site" else path.centers[0]
+    centers, anchor_m = (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
     tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)

@@ -242,7 +242,9 @@ def bins_on(on_map: JointMap) -> RangeBins:
 
 
 def _paper_table(on_map: RangesOnMap) -> TwoCandidate | None:
-    """Return the paper's table, with the anchors carried into the first camera's frame."""
+    """Return the paper's table of the ranges of the log, with the anchors carried into the first camera's frame."""
     problem, placed = on_map.problem, on_map.state.metric_from_model
     anchors = (on_map.state.anchors_m - placed.translation) @ placed.rotation
-    return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
+    anchor_m = anchors[problem.anchor_index]
+    table = two_candidate(problem.centers, problem.tag_from_center, anchor_m, problem.range_m)
+    return table and replace(table, rows=on_map.posed.rows[table.rows])
