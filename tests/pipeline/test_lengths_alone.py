@@ -98,12 +98,16 @@ def test_a_mistyped_length_among_four_is_named_and_left_out(room: Room, tmp_path
     assert [row.kind for row in summary.distances] == ["control", "left out", "control", "control"]
 
 
-def test_of_one_length_the_verdict_says_that_nothing_checks_it(room: Room, tmp_path: Path) -> None:
-    survey = room.survey(tmp_path, scale__distances=room.taped(tmp_path, PAIRS[:1]))
+@pytest.mark.parametrize("pairs", [((0, 7),), ((0, 7), (7, 0))], ids=["once", "twice"])
+def test_of_one_length_the_verdict_says_that_nothing_checks_it(
+    room: Room, tmp_path: Path, pairs: Sequence[tuple[int, int]]
+) -> None:
+    survey = room.survey(tmp_path, scale__distances=room.taped(tmp_path, pairs))
     summary = scale_model(survey, progress=QUIET).summary
     assert summary.scale.verdict == "doubtful"
     assert "one length that nothing checks" in summary.scale.reasons[0]
-    assert summary.tests[0].smallest_detectable is None
+    assert (summary.tests[0].smallest_detectable is None) == (len(pairs) == 1)
+    assert known(summary.reliability).scale_within is None
 
 
 def test_a_map_that_needs_no_times_is_compared_with_a_truth_that_has_them(room: Room, tmp_path: Path) -> None:

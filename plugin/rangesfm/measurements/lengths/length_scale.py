@@ -123,13 +123,18 @@ class LengthScale(KindOnMap):
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that nothing checks a single length, and that the lengths are too short."""
-        if len(self.rows) == 1:
+        if self._are_between_two_points:
             reason = "the scale depends on one length that nothing checks: a mistake in it changes the whole map"
             yield Doubt(reason, "measure another length, far from the first and in another direction")
         if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
             yield Doubt(
                 "the measured lengths are too short for their standard deviations", "measure more and longer lengths"
             )
+
+    @property
+    def _are_between_two_points(self) -> bool:
+        """Whether there is one length, however often it was taped: nothing checks between which points it is."""
+        return len(self.rows) == 1 or len({frozenset(one.ends) for one in self.taped}) == 1
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
         """Return the tests of each length against all else, and of all of them against other kinds."""
@@ -180,7 +185,7 @@ class LengthScale(KindOnMap):
         if compared:
             threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
             yield HiddenMistake("lengths", min(compared), threshold, 1, np.inf)
-        elif not is_checked.all():
+        elif self._are_between_two_points or not is_checked.all():
             yield HiddenMistake("length", np.inf, np.inf, 1, np.inf)
 
     def tested(self, placed: Similarity, others: Sequence[Observations], *, is_last: bool = False) -> LengthScale:

@@ -375,7 +375,7 @@ def refuse_open_turn(covariance: Array) -> None:
     if turn_stddev > _MAX_TURN_STDDEV:
         raise GeometryError(
             "the known positions are nearly on one line, which leaves the turn of the map about it open "
-            f"({np.rad2deg(turn_stddev):.0f} degrees, 1 stddev): survey a point off that line"
+            f"({np.rad2deg(min(turn_stddev, np.pi)):.0f} degrees, 1 stddev): survey a point off that line"
         )
 
 
