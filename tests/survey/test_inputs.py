@@ -172,3 +172,18 @@ def test_coordinates_that_are_all_alike_were_never_measured(survey: Survey) -> N
     read_ranging_inputs(of_tag.changed({"anchors.frame": "unknown"}))
     survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\nA,0,0,1\nB,,,\n")
     read_ranging_inputs(of_tag)
+
+
+@pytest.mark.parametrize(("east_m", "said"), [(10.0, ""), (691_000.0, "the positions are 6.91e+05 m or more from all")])
+def test_positions_out_of_the_radios_reach_are_in_another_frame(
+    survey: Survey, tmp_path: Path, east_m: float, said: str
+) -> None:
+    path = tmp_path / "positions.csv"
+    path.write_text(f"timestamp_s,x_m,y_m,z_m\n0,{east_m},1,1\n1,{east_m + 1},2,1\n")
+    of_tag = survey.changed({"tag.tag_id": "left", "positions.path": path})
+    if not said:
+        assert read_ranging_inputs(of_tag).positions.are_known
+        return
+    error = refusal(of_tag)
+    assert said in str(error)
+    assert error.path == path

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
@@ -27,6 +28,7 @@ from rangesfm.measurements.ranges.anchors.site import Site, local_site, site_of
 from rangesfm.measurements.ranges.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
+from rangesfm.measurements.ranges.readers.measured import REACH_M
 from rangesfm.options import RangesOptions
 from rangesfm.sfm.exif_positions import read_exif_positions
 from rangesfm.sfm.rigs import read_rigs
@@ -136,6 +138,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     if frame != "unknown":
         _check_anchors_differ(log, anchors, survey)
         _check_unit_of_anchors(log, anchors, survey)
+        _check_one_frame(log, anchors, positions)
     _check_held_out(survey, anchors, frame)
     curve_path, curve_notes = survey.ranges.error_curve, list[str]()
     if curve_path is not None:
@@ -351,6 +354,21 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], survey: Sur
         message = f"anchors {ids} are {apart_m[shown]:.6g} m apart here, and the ranges to them {ranges_m} m"
         asked = f"are the positions in {unit}? expected metres, or their unit (--anchor_unit)"
         raise InputError(f"{message}: {asked}", survey.anchors.path)
+
+
+def _check_one_frame(log: RangeLog, anchors: Sequence[Anchor], positions: SurveyedPositions) -> None:
+    """Raise InputError if known positions are all so far from the anchors that no range is measured between them."""
+    heard = [one.position_m for one in anchors if one.position_m is not None and one.anchor_id in log.anchor_ids]
+    known = [(positions.points.path, positions.points.positions_m)] if positions.points.points else []
+    if (antenna := positions.antenna) is not None:
+        known.append((antenna.log.path, antenna.log.position_m))
+    for path, positions_m in known if heard else ():
+        if (apart_m := float(cdist(positions_m, heard).min())) > REACH_M:
+            raise InputError(
+                f"the positions are {apart_m:.4g} m or more from all anchors, which no UWB radio reaches: expected "
+                "both in one frame, or with their coordinate systems (crs)",
+                path,
+            )
 
 
 def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
