@@ -297,6 +297,7 @@ def test_surveys_of_two_days_become_one_map(
     assert [(model["name"], model["joined"]) for model in result["models"]] == [("monday", True), ("tuesday", True)]
     path = trajectory_from_reconstruction(read_model(tmp_path / "site" / "sparse_metric" / "0"))
     assert exact.off_m(path.centers, with_scale=False) < 1e-4
+    assert not any("hold the map together" in reason for reason in result["scale"]["reasons"])
     log = exact.log  # a range that both surveys have counts once
     assert result["ranges"]["num_used"] == len({*zip(known(log.timestamp_s), log.anchor_index, strict=True)})
     assert (tmp_path / "site" / "report.html").is_file()
