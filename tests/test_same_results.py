@@ -390,7 +390,7 @@ def test_joined_models_give_what_they_gave(tmp_path: Path, rangesfm_command: Com
         part.sfm.write(tmp_path / day)
         flags = ("--input_path", day, "--images", "images.csv", *radio, "--output_path", f"{day}/out", "--no_report")
         rangesfm_command("scale", *flags, "--quiet", cwd=tmp_path)
-    words = {"verdict": "doubtful", "reason": "the photos do not hold the map together: 14 of its 28 photos"}
+    words = {"verdict": "doubtful", "reason": "the scale is known to 4.4 % (95 % interval)"}
     compare("joined", result_of("join", "monday/out", "tuesday/out", cwd=tmp_path, run=rangesfm_command, **words))
 
 
