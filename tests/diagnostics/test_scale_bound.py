@@ -14,7 +14,7 @@ from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.measurements.ranges.mistakes import hypothesis_tests
 from rangesfm.measurements.ranges.mistakes.catalogue import anchor_places, wrong_lever_arms
 from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import judged
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.mistakes import RISK, HiddenMistake
 from rangesfm.solver.noise import Component
@@ -31,7 +31,7 @@ def problem() -> Linearized:
 
 
 def results_of(problem: Linearized) -> list[hypothesis_tests.Test]:
-    return Factorization(problem).test([*anchor_places(problem), *wrong_lever_arms(problem)], 0)
+    return judged(problem, [*anchor_places(problem), *wrong_lever_arms(problem)], 0)
 
 
 def test_without_a_mistake_the_bound_is_that_of_a_normal_error() -> None:
@@ -70,8 +70,9 @@ def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: L
     for test in results_of(problem):
         columns, seen, num = test.hypothesis.columns, test.hypothesis.seen, len(problem.bins)
         off_m = columns[:num] if seen is None else seen
-        of_units = [replace(problem, residual_m=made[:num], prior_residual=made[num:]) for made in columns.T]
-        left = np.stack([Factorization(made).residual for made in of_units], axis=1)
+        made = np.pad(columns, ((0, len(problem.residual) - len(columns)), (0, 0))).T
+        of_units = [replace(problem, residual_m=off[:num], prior_residual=off[num:]) for off in made]
+        left = np.stack([each.solution.residual for each in of_units], axis=1)
         directions = np.random.default_rng(0).standard_normal((test.hypothesis.num, 1000))
         shares = np.sum((left @ directions) ** 2, axis=0)
         shares /= np.einsum("ij,ik,kj->j", off_m @ directions, inverse, off_m @ directions)

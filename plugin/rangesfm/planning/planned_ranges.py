@@ -14,7 +14,7 @@ from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, row_of
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import estimates, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -141,7 +141,7 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     here, bins = ranges.solved, bins_on(on_map)
     problem = Linearized.by_ranges(in_bins(here, bins, here.noise_stddev_m, {}, np.zeros(len(bins))), here, 0.0)
     found = []
-    for test in Factorization(problem).estimates([each for of_kind in STANDING for each in of_kind(problem)]):
+    for test in estimates(problem, [each for of_kind in STANDING for each in of_kind(problem)]):
         row = row_of(test)
         sizes: dict[str, float] = {name: getattr(row, name) for name in SIZES}
         if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest

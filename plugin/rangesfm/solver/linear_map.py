@@ -8,6 +8,7 @@ chi-square distributed with as many degrees of freedom as H has columns.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -87,8 +88,7 @@ class LinearMap:
     def with_more(self, unknowns: Sequence[Array]) -> LinearMap:
         """Return the equations with further unknowns, by effects (c, m) on observations, or (c + r, m) on all."""
         num, own = len(self.residual_m), self.jacobian
-        effects = (np.pad(each, ((0, len(own) - len(each)), (0, 0))) for each in unknowns)
-        columns = np.hstack([own, *effects])
+        columns = _side_by_side([own, *unknowns], len(own))
         return LinearMap(self.columns, columns[:num], self.residual_m, self.prior_residual, columns[num:])
 
     def solved(self, covariance_m2: Array) -> Solved:
@@ -132,6 +132,19 @@ class EstimatedMistake:
         """(k,) standard deviations of the sizes; inf if a direction is hidden."""
         return np.linalg.norm(self.root, axis=1) if self.is_seen else np.full(len(self.sizes), np.inf)
 
+    def redundancy_against(self, seen: Array) -> float:
+        """Return how much of the mistake the other observations check, 0 to 1, in the worst direction.
+
+        It is the share of its information in the observations that the unknowns leave (Baarda's redundancy number, for
+        several numbers).
+
+        Args:
+            seen: (c, k) its whitened effect on the observations of a map that is known.
+        """
+        if not self.is_seen:
+            return 0.0
+        return float(np.clip(np.linalg.norm(seen @ self.root, 2) ** -2, 0.0, 1.0))
+
 
 class Solved:
     """The decompositions of a linear problem with given errors, which its estimate and all mistakes in it share.
@@ -145,7 +158,7 @@ class Solved:
     """
 
     def __init__(self, covariance_m2: Array, design: Array, residual: Array):
-        self.lower = np.linalg.cholesky(regular(covariance_m2))
+        self.lower, self._num = np.linalg.cholesky(regular(covariance_m2)), len(residual)
         whitened = self.whitened(design)
         lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-100)
         basis, values, turns = np.linalg.svd(whitened / lengths, full_matrices=False)
@@ -155,15 +168,20 @@ class Solved:
         self._whole = self.whitened(residual[:, None])
         self.residual = self.left(self._whole)[:, 0]
 
-    def whitened(self, effects: Array) -> Array:
-        """Return effects on all residuals (c + r, k), or on the observations (c, k), in standard deviations."""
-        num = len(self.lower)
-        return np.vstack([solve_triangular(self.lower, effects[:num], lower=True), effects[num:]])
+    def whitened(self, *effects: Array) -> Array:
+        """Return the (c + r, k) effects of all, by those (c, m) on observations or (c + r, m) on all, in stddevs."""
+        num, together = len(self.lower), _side_by_side(effects, self._num)
+        return np.vstack([solve_triangular(self.lower, together[:num], lower=True), together[num:]])
 
     def left(self, whitened: Array) -> Array:
         """Return what the unknowns cannot explain of whitened effects (c + r, k)."""
         left: Array = whitened - self._basis @ (self._basis.T @ whitened)
         return left
+
+    @property
+    def misfit(self) -> float:
+        """Sum of the squared residuals that the unknowns leave, with those of the priors, in standard deviations."""
+        return float(self.residual @ self.residual)
 
     @property
     def step(self) -> Array:
@@ -185,12 +203,15 @@ class Solved:
         num = len(self.lower)
         return solve_triangular(self.lower, self._gains[:, :num].T, lower=True, trans=1).T, self._gains[:, num:]
 
-    def mistake(self, columns: Array) -> EstimatedMistake:
-        """Estimate a mistake of k numbers by its effects (c, k) on the observations."""
-        whitened = self.whitened(np.pad(columns, ((0, len(self.residual) - len(columns)), (0, 0))))
-        return self.estimated(whitened, self.left(whitened), self.by_unknowns(whitened))
+    def mistakes(self, effects: Sequence[Array]) -> list[EstimatedMistake]:
+        """Estimate mistakes, each of k numbers, by effects (c, k) on observations or (c + r, k) on all residuals."""
+        whitened = self.whitened(*effects)
+        left, by_unknowns = self.left(whitened), self.by_unknowns(whitened)
+        ends = np.cumsum([0, *(each.shape[1] for each in effects)]).tolist()
+        parts = (slice(*each) for each in itertools.pairwise(ends))
+        return [self._mistake(whitened[:, part], left[:, part], by_unknowns[:, part]) for part in parts]
 
-    def estimated(self, whitened: Array, left: Array, by_unknowns: Array) -> EstimatedMistake:
+    def _mistake(self, whitened: Array, left: Array, by_unknowns: Array) -> EstimatedMistake:
         """Estimate a mistake, given its whitened effect (c + r, k), what is left of it, and the change by it."""
         lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
         basis, values, turns = np.linalg.svd(left / lengths, full_matrices=False)
@@ -204,6 +225,11 @@ class Solved:
             smallest = size * float(np.linalg.norm(root, 2) if len(root) > 1 else abs(root[0, 0]))
             effect = size * float(np.linalg.norm(by_unknowns[:1] @ root))
         return EstimatedMistake(root @ pulls, root, float(pulls @ pulls), by_unknowns, basis, smallest, effect)
+
+
+def _side_by_side(effects: Sequence[Array], num: int) -> Array:
+    """Return effects on all ``num`` residuals together, of which some are on the first ones alone."""
+    return np.hstack([np.pad(each, ((0, num - len(each)), (0, 0))) for each in effects])
 
 
 @cache

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
-from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, regular
+from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, Solved, regular
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 
@@ -128,21 +128,6 @@ class Posterior:
         assert self.placement is not None, "the map is placed"
         return self.placement
 
-    @classmethod
-    def best(cls, linear: LinearMap, noise: Noise, formal: float) -> Posterior:
-        """Return the posterior with the best weights for the errors (Gauss and Markov).
-
-        Args:
-            formal: relative standard deviation of the scale, as if all observations erred independently.
-        """
-        best = linear.solved(noise.covariance_m2)
-        of_observations, of_priors = best.gains
-        components = noise.effects(of_observations[0])
-        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
-            components[GIVEN] = given
-        uncertainty = ScaleUncertainty(formal, components)
-        return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0], best.pulls)
-
 
 @dataclass(frozen=True, kw_only=True)
 class JointProblem(LinearMap):
@@ -169,11 +154,22 @@ class JointProblem(LinearMap):
         """Errors of all observations."""
         return noise_of_sizes(self.components, self.sizes, len(self.is_used))
 
+    @cached_property
+    def solution(self) -> Solved:
+        """The estimate by the observations that are used, with the best weights for these errors (Gauss and Markov)."""
+        linear, noise = self.among(self.is_used)
+        return linear.solved(noise.covariance_m2)
+
     @property
-    def unlikeliness(self) -> float:
-        """-2 times the logarithm of the prior probability of the sizes, up to a constant."""
+    def deviance(self) -> float:
+        """-2 times the log-likelihood of observations and sizes, up to a constant.
+
+        It compares two explanations of the same observations, each with the errors that it leaves.
+        """
         learnt = (each for each in self.components if each.spread > 0)
-        return float(sum((np.log(self.sizes[each.name] / each.median) / each.spread) ** 2 for each in learnt))
+        of_sizes = (np.log(self.sizes[each.name] / each.median) / each.spread for each in learnt)
+        log_determinant = 2 * float(np.sum(np.log(np.diag(self.solution.lower))))
+        return self.solution.misfit + log_determinant + float(sum(off**2 for off in of_sizes))
 
     def without(self, kind: str, name: str) -> JointProblem:
         """Return the problem without one component of the errors of a kind."""
@@ -255,15 +251,27 @@ class JointProblem(LinearMap):
         Observations that it changes are taken into the equations, whether they take part or not.
         """
         rows = self.is_used | np.any(columns != 0, axis=1)
-        linear, noise = self.among(rows)
-        return linear.solved(noise.covariance_m2).mistake(-columns[rows])
+        problem = self if np.array_equal(rows, self.is_used) else replace(self, is_used=rows)
+        return problem.solution.mistakes([-columns[rows]])[0]
 
-    def posterior(self, *, is_refined: bool = False) -> Posterior:
-        """Return what all observations say of the map; ``is_refined``: whether the photos let it bend in its fit."""
-        at, (linear, noise) = np.ix_(self.is_used, self.is_used), self.among(self.is_used)
-        alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
-        formal = float(np.sqrt(linear.solved(alone_m2[at]).covariance[0, 0]))
-        return Posterior.best(linear, noise, formal)
+    def posterior(self, *, formal: float | None = None, is_refined: bool = False) -> Posterior:
+        """Return what the observations that are used say of the map.
+
+        Args:
+            formal: relative standard deviation of the scale as if all of them erred independently; None: that of the
+                estimate with weights for such errors. is_refined: whether the photos let the map bend in its fit.
+        """
+        best, (linear, noise) = self.solution, self.among(self.is_used)
+        if formal is None:
+            alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
+            alone = linear.solved(alone_m2[np.ix_(self.is_used, self.is_used)])
+            formal = float(np.sqrt(alone.covariance[0, 0]))
+        of_observations, of_priors = best.gains
+        components = noise.effects(of_observations[0])
+        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
+            components[GIVEN] = given
+        uncertainty = ScaleUncertainty(formal, components)
+        return Posterior(uncertainty, self.columns, best.covariance, best.step, of_observations[0], best.pulls)
 
     def predicted_m2(self, kind: str, covariance: Array) -> Array:
         """Return the (c, c) covariance of the errors of unused functions of the map, after all that is observed.

@@ -259,7 +259,6 @@ def _test(problem: JointProblem, columns: Array) -> tuple[float, float, float]:
     found = problem.mistake(columns)
     if not found.is_seen or not np.isfinite(found.stddevs[0]):
         return 0.0, np.inf, 0.0
-    used = problem.is_used | np.any(columns != 0, axis=1)
-    at = np.flatnonzero(columns[used, 0])[0]
-    precision = float(np.linalg.inv(problem.noise.of_rows(used).covariance_m2)[at, at])
-    return float(found.sizes[0]), float(found.stddevs[0]), float(found.stddevs[0] ** -2 / precision)
+    rows = problem.is_used | np.any(columns != 0, axis=1)
+    seen = replace(problem, is_used=rows).solution.whitened(columns[rows])
+    return float(found.sizes[0]), float(found.stddevs[0]), found.redundancy_against(seen)

@@ -428,7 +428,7 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
 
     def tested(some: Sequence[str], beside: Sequence[str]) -> list[MistakeTest]:
         others = linear.with_more([columns[name][rows] for name in beside]).solved(noise.covariance_m2)
-        found = {name: others.mistake(-columns[name][rows]) for name in some}
+        found = dict(zip(some, others.mistakes([-columns[name][rows] for name in some]), strict=True))
         by_scale = {name: gains @ columns[name][problem.is_used] for name in some}
         tests = (_of_point(positions, name, found[name], by_scale[name], threshold) for name in some)
         return sorted(tests, key=lambda test: -test.statistic)

@@ -16,7 +16,7 @@ from rangesfm.measurements.ranges.mistakes import hypothesis_tests
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
 from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
 from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Hypothesis
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, overlap, row_of
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import judged, overlap, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
@@ -35,9 +35,10 @@ def hypotheses(problem: Linearized) -> list[Hypothesis]:
 
 
 def with_mistake(problem: Linearized, mistake: Array) -> Linearized:
-    """The problem without noise, with the effect of a mistake (c + r,) on bins and priors."""
-    num = len(problem.bins)
-    return replace(problem, residual_m=mistake[:num], prior_residual=mistake[num:])
+    """The problem without noise, with the effect of a mistake (c + r,) on bins and priors, or (c,) on bins alone."""
+    num, off = len(problem.bins), np.zeros(len(problem.residual))
+    off[: len(mistake)] = mistake
+    return replace(problem, residual_m=off[:num], prior_residual=off[num:])
 
 
 def without_noise(problem: Linearized) -> Linearized:
@@ -49,7 +50,7 @@ def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> No
     for each in hypotheses(problem):
         size = np.arange(1.0, each.num + 1)
         made = with_mistake(silent, each.columns @ size)
-        [test] = Factorization(made).test([each], 0)
+        [test] = judged(made, [each], 0)
         if np.isfinite(test.smallest_detectable):
             np.testing.assert_allclose(test.sizes, size, rtol=1e-5)
 
@@ -57,13 +58,13 @@ def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> No
 def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem: Linearized) -> None:
     silent = without_noise(problem)
     for each in hypotheses(problem):
-        [test] = Factorization(silent).test([each], 0)
+        [test] = judged(silent, [each], 0)
         if each.num == 1 and np.isfinite(test.smallest_detectable):
             size = np.array([test.smallest_detectable])
             made = with_mistake(silent, each.columns @ size)
-            [found] = Factorization(made).test([each], 0)
+            [found] = judged(made, [each], 0)
             assert found.statistic == pytest.approx(noncentrality(1), rel=1e-4)
-            moved = Factorization(made).step[0]
+            moved = made.solution.step[0]
             assert abs(moved) == pytest.approx(found.effect_on_log_scale, rel=1e-3, abs=1e-9)
 
 
@@ -74,7 +75,7 @@ def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(
         for share in (0.5, 1.5):
             size = share * each.most * direction
             made = with_mistake(silent, each.columns @ size)
-            [test] = Factorization(made).test([each], 0)
+            [test] = judged(made, [each], 0)
             if np.isfinite(test.smallest_detectable):
                 told = row_of(test).size
                 signed = -share * each.most if each.num == 1 else share * each.most
@@ -86,7 +87,7 @@ def test_hypotheses_that_explain_nearly_the_same_overlap_and_others_do_not(probl
     of_key = {each.key: each for each in hypotheses(problem)}
     bias, drift = of_key["common bias", ""], of_key["radio drift", ""]
     both = replace(bias, columns=bias.columns + 0.1 * drift.columns)
-    tests = Factorization(without_noise(problem)).test([bias, both, drift], 0)
+    tests = judged(without_noise(problem), [bias, both, drift], 0)
     assert overlap(tests[0], tests[0]) == pytest.approx(1.0)
     assert 0.9 < overlap(tests[0], tests[1]) < 1.0
     assert overlap(tests[0], tests[2]) < 0.9
@@ -112,7 +113,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
 ) -> None:
     rng, num = np.random.default_rng(1), 150
     factor, tried = np.linalg.cholesky(problem.noise.covariance_m2), hypotheses(problem)
-    thresholds = np.array([test.threshold for test in Factorization(problem).test(tried, 0)])
+    thresholds = np.array([test.threshold for test in judged(problem, tried, 0)])
     # The thresholds do not depend on the measurements, and they are most of the work.
     monkeypatch.setattr(hypothesis_tests, "_thresholds", lambda *_: thresholds)
     alarms = 0
@@ -120,7 +121,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
         num_priors = len(problem.prior_residual)
         off = np.append(factor @ rng.standard_normal(len(factor)), rng.standard_normal(num_priors))
         drawn = with_mistake(problem, off)
-        tests = Factorization(drawn).test(tried, 0)
+        tests = judged(drawn, tried, 0)
         alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))
     assert stats.binom.sf(alarms - 1, num, FALSE_ALARM_RATE) > 0.001
 

@@ -361,11 +361,10 @@ def _place_m(located: Linearized, k: int) -> Array:
 
 def _bias(located: Linearized, k: int) -> tuple[float, float]:
     """Return the bias of an anchor's ranges from its prior mean, and its standard deviation, metres."""
-    solved = located.solved(located.noise.covariance_m2)
+    solved = located.solution
     stddev_m = float(located.on_map.problem.bias_stddev_m[k])
     of_bins = stddev_m**2 * (located.bins.anchor_index == k)
-    of_all = np.append(of_bins, np.zeros(len(located.prior_residual)))
-    left = solved.left(solved.whitened(of_all[:, None]))[:, 0]
+    left = solved.left(solved.whitened(of_bins[:, None]))[:, 0]
     return -float(left @ solved.residual), float(np.sqrt(np.maximum(stddev_m**2 - left @ left, 0.0)))
 
 
@@ -377,7 +376,7 @@ def _covariance(located: Linearized, k: int) -> Array:
     misfit is higher by that of one standard deviation.
     """
     noise_m2, own = located.noise.covariance_m2, located.columns.anchor[k] + np.arange(3)
-    whole = located.solved(noise_m2).covariance
+    whole = located.solution.covariance
     covariance: Array = whole[np.ix_(own, own)]
     variances, axes = np.linalg.eigh(covariance)
     along, problem = axes[:, 2], located.on_map.problem
@@ -398,7 +397,7 @@ def _covariance(located: Linearized, k: int) -> Array:
             state = state_after((located.columns,), moved.on_map.state, step)
             moved, before = located.at_state(replace(located.on_map, state=state)), found
             best = solved(moved)
-            found, step = float(best.residual @ best.residual), np.zeros(len(tied))
+            found, step = best.misfit, np.zeros(len(tied))
             if abs(before - found) < NEGLIGIBLE_STDDEVS:
                 break
             step[own] = free[own] @ best.step

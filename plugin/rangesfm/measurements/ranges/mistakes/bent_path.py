@@ -11,7 +11,6 @@ from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, is_nearly_at, linearized
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
@@ -43,7 +42,7 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
         return bent
 
     def with_deviance(bent: RangesOnMap) -> tuple[float, RangesOnMap]:
-        return Factorization(problem.at_other_map(bent).with_learnt_errors()).deviance(), bent
+        return problem.at_other_map(bent).with_learnt_errors().deviance, bent
 
     def likelier(best: tuple[float, RangesOnMap], start: RangesOnMap) -> tuple[float, RangesOnMap]:
         other = with_deviance(_bent(start))
@@ -166,10 +165,10 @@ def _likelier_sides(on_map: RangesOnMap, unknown: Sequence[int]) -> AnchorSides:
         other = _on_other_side(problem, k)
         if np.linalg.norm(_place_m(other, k) - _place_m(problem, k)) < problem.scatter_m:  # there is one place only
             continue
-        gain = problem.misfit - other.misfit
+        gain = problem.solution.misfit - other.solution.misfit
         if gain > 0:  # learning the errors takes time, and it hardly changes which side fits better
             other = other.with_learnt_errors()
-            gain = Factorization(problem).deviance() - Factorization(other).deviance()
+            gain = problem.deviance - other.deviance
         likelier, less_likely = (other, problem) if gain > 0 else (problem, other)
         is_open = abs(gain) < SIGNIFICANT_STDDEVS**2
         mirrors_m[on_map.anchor_ids[k]] = _place_m(less_likely, k) if is_open else None

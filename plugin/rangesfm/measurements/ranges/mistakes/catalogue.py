@@ -16,7 +16,6 @@ from rangesfm.measurements.ranges.mistakes.hypothesis import (
     is_given,
     longest_m,
     of_anchor_place,
-    of_bins,
     too_long,
 )
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
@@ -45,7 +44,7 @@ def _lengthening(problem: Linearized, name: str, share: Array, **told: Any) -> H
     """Return: ranges read too long by a size times a share (n,) of each; ``told``: further attributes."""
     return Hypothesis(
         name,
-        of_bins(problem, -problem.bins.mean(share)),
+        -problem.bins.mean(share)[:, None],
         correction=lambda size: Correction(longer_m=size[0] * share),
         is_linear=True,
         **told,
@@ -128,7 +127,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
     distance_m = problem.on_map.problem.range_m
     yield Hypothesis(
         "range scale",
-        of_bins(problem, -problem.gradient.distance_m),
+        -problem.gradient.distance_m[:, None],
         words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
         remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
         correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
@@ -244,7 +243,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "lever arm",
-        of_bins(problem, np.where((problem.bins.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)),
+        np.where((problem.bins.tag_index == k)[:, None], -problem.by_lever_arm, 0.0),
         subject=name,
         words=words,
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
@@ -300,7 +299,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "clock offset",
-        of_bins(problem, -by_time),
+        -by_time[:, None],
         words=lambda size: f"the time offset between the clocks is wrong: it needs about {size[0]:+.2f} s more",
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=float(size[0])),
@@ -309,7 +308,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "clock drift",
-        of_bins(problem, -by_time * since),
+        -(by_time * since)[:, None],
         words=lambda size: (
             f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"
         ),

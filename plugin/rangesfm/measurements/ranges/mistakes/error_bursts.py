@@ -16,8 +16,8 @@ from scipy import special
 from rangesfm.arrays import Indices
 from rangesfm.measurements.ranges.errors.components import BURSTS, LASTING_S
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
-from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis, longest_m, of_bins
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis, longest_m
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import estimates
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.solver.noise import Component
@@ -39,13 +39,13 @@ def without_bursts(problem: Linearized, standing: Sequence[Hypothesis], hypothes
     threshold = float(special.chdtri(1, FALSE_ALARM_RATE / len(windows)))
     problem = problem.with_learnt_errors(explaining)
     for _ in range(_MAX_NUM_BURSTS):
-        factorized = Factorization(problem)
-        left = factorized.left(factorized.whitened(of_bins(problem, within)))
-        statistics = (left.T @ factorized.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)) ** 2
+        solution = problem.solution
+        left = solution.left(solution.whitened(within))
+        statistics = (left.T @ solution.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)) ** 2
         best = int(np.argmax(statistics))
         if statistics[best] < threshold:
             break
-        possible = (test for test in factorized.estimates(hypotheses) if test.is_possible)
+        possible = (test for test in estimates(problem, hypotheses) if test.is_possible)
         likeliest = max((test.statistic - test.penalty(num) for test in possible), default=0.0)
         if statistics[best] - float(np.log(num)) < likeliest:
             break

@@ -13,7 +13,7 @@ from rangesfm.measurements.ranges.mistakes.bent_path import as_given, bent_to_ra
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
 from rangesfm.measurements.ranges.mistakes.error_bursts import without_bursts
 from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Hypothesis, corrected
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, Test, hidden_among, overlap
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Test, estimates, hidden_among, judged, overlap
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
 from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, state_after
@@ -116,14 +116,14 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = without_bursts(problem, standing, hypotheses)
-    all_tests = Factorization(problem).test(hypotheses, seed)
+    all_tests = judged(problem, hypotheses, seed)
     tests = _best_of_each(all_tests, problem)
     possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
     causes = _causes(problem, rejected or possible[:_NUM_NEARLY], len(all_tests), is_sure=bool(rejected))
     if causes and causes[0].test is not None:
         problem = problem.with_learnt_errors([h.columns for h in (*standing, causes[0].test.hypothesis)])
-        tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+        tests = _best_of_each(judged(problem, hypotheses, seed), problem)
     return Findings(problem, tuple(tests), tuple(causes), hidden_among(all_tests))
 
 
@@ -134,13 +134,12 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
         nominated: tests whose hypotheses are tried. num_tests: number of all tests.
         is_sure: whether the nominated tests exceed their thresholds.
     """
-    before = Factorization(_near_likeliest(problem).with_learnt_errors()).deviance()
+    before = _near_likeliest(problem).with_learnt_errors().deviance
     num = len(problem.bins)
     causes = []
-    factorized = Factorization(problem)
     for test in _varied(nominated):
         # Ranges between the true time of a mistake and a tried one fit neither way.
-        at_times = factorized.estimates([test.hypothesis, *test.hypothesis.refine_time()])
+        at_times = estimates(problem, [test.hypothesis, *test.hypothesis.refine_time()])
         best = max(at_times, key=lambda each: each.statistic).hypothesis
         again, deviance, state = _settled_test(problem, best)
         gain = before - deviance
@@ -188,15 +187,14 @@ def _settled_test(problem: Linearized, original: Hypothesis) -> tuple[Test, floa
     """
     at, hypothesis, undone, before, diverges = problem, original, *np.zeros((2, original.num)), True
     for _ in range(MAX_NUM_ROUNDS):
-        factorized = Factorization(at)
-        [test] = factorized.estimates([hypothesis])
+        [test] = estimates(at, [hypothesis])
         sizes = undone + test.sizes
         if np.linalg.norm(sizes - before) <= _SETTLED * np.linalg.norm(sizes):
             diverges = False
             break
         if not original.can_be(sizes):
             break
-        step = factorized.step_with(hypothesis.columns @ test.sizes)
+        step = at.solution.step - test.by_unknowns @ test.sizes
         moved, before = replace(problem.on_map, state=state_after((at.columns,), at.on_map.state, step)), sizes
         if original.is_linear:
             at = at.at_state(moved)
@@ -204,9 +202,9 @@ def _settled_test(problem: Linearized, original: Hypothesis) -> tuple[Test, floa
             at, undone = at.at_state(corrected(moved, original.correction(sizes))), sizes
             found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.sub_hypotheses))
             hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
-    factorized = Factorization(at.with_learnt_errors([hypothesis.columns]))
-    [test] = factorized.estimates([hypothesis])
-    deviance = np.inf if diverges else factorized.deviance(test.statistic)
+    at = at.with_learnt_errors([hypothesis.columns])
+    [test] = estimates(at, [hypothesis])
+    deviance = np.inf if diverges else at.deviance - test.statistic
     return replace(test, hypothesis=original, sizes=undone + test.sizes), deviance, at.on_map.state
 
 
@@ -237,11 +235,11 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Hypothesis
         at = problem.at_other_map(refitted) if is_walk else problem.at_state(refitted)
         found.append((_near_likeliest(at).with_learnt_errors(), each))
     if is_walk:
-        found.sort(key=lambda one: Factorization(one[0]).deviance())
+        found.sort(key=lambda one: one[0].deviance)
         bent = ((bent_to_ranges(near.on_map), each) for near, each in found[:_NUM_BENT])
         found = [(problem.at_other_map(on_map).with_learnt_errors(), each) for on_map, each in bent]
     for near, each in found:
-        gain, nothing = before - Factorization(near).deviance(), np.zeros(0)
+        gain, nothing = before - near.deviance, np.zeros(0)
         num_free = 3 * sum(place is None for place in each.correction(nothing).anchors_m.values())
         penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.bins)))
         if gain > penalty + _AS_LIKELY:
@@ -250,10 +248,10 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Hypothesis
 
 def _near_likeliest(problem: Linearized) -> Linearized:
     """Move to the likeliest state if a linear step improves it; from far away it does not."""
-    here = Factorization(problem.with_usual_errors())
-    state = state_after((problem.columns,), problem.on_map.state, here.step)
+    step = problem.with_usual_errors().solution.step
+    state = state_after((problem.columns,), problem.on_map.state, step)
     there = problem.at_state(replace(problem.on_map, state=state))
-    return min(problem, there, key=lambda each: Factorization(each.with_usual_errors()).deviance())
+    return min(problem, there, key=lambda each: each.with_usual_errors().deviance)
 
 
 def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:

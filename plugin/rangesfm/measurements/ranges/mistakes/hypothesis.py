@@ -47,8 +47,8 @@ class Hypothesis:
 
     Attributes:
         name: of its kind. subject: which one of the kind, such as an anchor's id; may be empty.
-        columns: (c + r, k) derivatives by these of the residuals of the bins, metres per unit, and below them of the
-            residuals of the priors, in standard deviations per unit.
+        columns: (c, k) derivatives by these of the residuals of the bins, metres per unit; or (c + r, k), with those of
+            the residuals of the priors below them, in standard deviations per unit.
         words: returns for an estimate (k,) what is probably the case.
         remedy: what to measure or to change.
         correction: returns for an estimate the changes that undo the mistake.
@@ -92,7 +92,7 @@ class Hypothesis:
             return self
         steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
         slopes = [(step - longer_m) / _SMALL for step in steps]
-        return replace(self, columns=of_bins(problem, -problem.bins.mean(np.stack(slopes, axis=1))))
+        return replace(self, columns=-problem.bins.mean(np.stack(slopes, axis=1)))
 
     def can_be(self, sizes: Array) -> bool:
         """Return True if a mistake of this size (k,) is possible."""
@@ -110,12 +110,6 @@ class Hypothesis:
     @property
     def key(self) -> tuple[str, str]:
         return self.name, self.subject
-
-
-def of_bins(problem: Linearized, columns: Array) -> Array:
-    """Return the (c + r, k) effects of (c, k) or (c,) effects on the bins alone, without a part in the priors."""
-    columns = columns.reshape(len(problem.bins), -1)
-    return np.pad(columns, ((0, len(problem.prior_residual)), (0, 0)))
 
 
 def is_given(problem: Linearized, anchor: int) -> bool:
@@ -141,12 +135,12 @@ def duration_s(problem: Linearized) -> float:
 
 def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Array:
     """Return the effect of an anchor that is off its given position along directions (3, k), towards its true place."""
-    stddev_m = problem.on_map.problem.anchor_stddev_m
+    stddev_m, columns = problem.on_map.problem.anchor_stddev_m, np.zeros((len(problem.residual), directions.shape[1]))
     if problem.columns.anchor[anchor] < 0:
         is_of = (problem.bins.anchor_index == anchor)[:, None]
-        return of_bins(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
+        columns[: len(problem.bins)] = np.where(is_of, problem.gradient.by_tag @ directions, 0.0)
+        return columns
     has_rows = (problem.columns.anchor >= 0) & np.isfinite(stddev_m)
-    columns = of_bins(problem, np.zeros((len(problem.bins), directions.shape[1])))
     row = len(problem.bins) + 3 * np.count_nonzero(has_rows[:anchor])
     columns[row : row + 3] = directions / stddev_m[anchor]
     return columns

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
-from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, noncentrality
 from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, row_of_mistake
-from rangesfm.util.geometry.numerics import UNDETERMINED
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000
@@ -27,8 +25,7 @@ class Test(EstimatedMistake):
 
     Attributes:
         threshold: of the statistic, for all hypotheses together.
-        redundancy: how much of the mistake the other observations check, 0 to 1: the share of its information in the
-            ranges that the unknowns leave, in the worst direction (Baarda's redundancy number, for several numbers).
+        redundancy: how much of the mistake the other observations check, 0 to 1.
         effect_on_place_m: largest effect of an undetected mistake of the smallest detectable size.
     """
 
@@ -62,80 +59,39 @@ class Test(EstimatedMistake):
         return self.is_possible and self.statistic > self.threshold
 
 
-class Factorization(Solved):
-    """The solution of a problem, with the tests of all mistakes in it."""
+def judged(problem: Linearized, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
+    """Test all hypotheses, with thresholds that hold for all together."""
+    tests = estimates(problem, hypotheses)
+    thresholds = _thresholds([t.basis for t in tests], np.array([t.num for t in tests]), seed)
+    return [replace(t, threshold=threshold) for t, threshold in zip(tests, thresholds.tolist(), strict=True)]
 
-    def __init__(self, problem: Linearized):
-        super().__init__(problem.noise.covariance_m2, problem.jacobian, problem.residual)
-        self.problem = problem
-        # Quadratic form of the path's mean square displacement in the unknowns.
-        place = problem.place.reshape(-1, problem.columns.num)
-        self._place = place.T @ place / len(problem.place)
 
-    def deviance(self, explained: float = 0.0) -> float:
-        """Return -2 times the log-likelihood of observations and errors, up to a constant.
-
-        It compares two explanations of the same bins, each with the errors that it leaves.
-
-        Args:
-            explained: the part of the sum of squares that a mistake explains, its statistic.
-        """
-        return (
-            float(self.residual @ self.residual)
-            - explained
-            + 2 * float(np.sum(np.log(np.diag(self.lower))))
-            + self.problem.unlikeliness
+def estimates(problem: Linearized, hypotheses: Sequence[Hypothesis]) -> list[Test]:
+    """Test all hypotheses without thresholds."""
+    solution, place = problem.solution, problem.place.reshape(-1, problem.columns.num)
+    # Quadratic form of the path's mean square displacement in the unknowns.
+    of_place = place.T @ place / len(problem.place)
+    found = solution.mistakes([each.columns for each in hypotheses])
+    effects = (each.columns[: len(problem.bins)] if each.seen is None else each.seen for each in hypotheses)
+    seen = np.split(solution.whitened(*effects), np.cumsum([h.num for h in hypotheses])[:-1], axis=1)
+    return [
+        Test(
+            **vars(one),
+            hypothesis=hypothesis,
+            threshold=np.inf,
+            redundancy=one.redundancy_against(on_known_map),
+            effect_on_place_m=_effect_on_place_m(one, of_place),
         )
-
-    def step_with(self, mistake: Array) -> Array:
-        """Return the (p,) step from the state to the likeliest one, given the effect (c + r,) of a mistake."""
-        return self.step - self.by_unknowns(self.whitened(mistake[:, None]))[:, 0]
-
-    def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
-        """Test all hypotheses, with thresholds that hold for all together."""
-        tests = self.estimates(hypotheses)
-        thresholds = _thresholds([t.basis for t in tests], np.array([t.num for t in tests]), seed)
-        return [replace(t, threshold=threshold) for t, threshold in zip(tests, thresholds.tolist(), strict=True)]
-
-    def estimates(self, hypotheses: Sequence[Hypothesis]) -> list[Test]:
-        """Test all hypotheses without thresholds."""
-        whitened = self.whitened(np.hstack([h.columns for h in hypotheses]))
-        left, by_unknowns = self.left(whitened), self.by_unknowns(whitened)
-        ends = np.cumsum([h.num for h in hypotheses])
-        parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
-        return [
-            self._test(h, whitened[:, part], left[:, part], by_unknowns[:, part])
-            for h, part in zip(hypotheses, parts, strict=True)
-        ]
-
-    def _test(self, hypothesis: Hypothesis, whitened: Array, left: Array, by_unknowns: Array) -> Test:
-        found, on_place, redundancy = self.estimated(whitened, left, by_unknowns), np.inf, 0.0
-        if found.is_seen:
-            of_unit = by_unknowns @ found.root
-            worst = np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1]
-            on_place = float(np.sqrt(noncentrality(found.num) * max(worst, 0.0)))
-            # The effect on the ranges of a map that is known.
-            seen = whitened[: len(self.lower)]
-            if hypothesis.seen is not None:
-                seen = solve_triangular(self.lower, hypothesis.seen, lower=True)
-            redundancy = _redundancy(left, seen)
-        return Test(
-            **vars(found), hypothesis=hypothesis, threshold=np.inf, redundancy=redundancy, effect_on_place_m=on_place
-        )
+        for hypothesis, one, on_known_map in zip(hypotheses, found, seen, strict=True)
+    ]
 
 
-def _redundancy(left: Array, seen: Array) -> float:
-    """Return the smallest share, over all directions, of an effect's squared length that is left.
-
-    Args:
-        left, seen: (c + r, k) and (c, k) whitened effects, with all unknowns projected off, and with all of them known.
-    """
-    of_left, of_seen = left.T @ left, seen.T @ seen
-    values, vectors = np.linalg.eigh(of_seen)
-    if values[0] <= UNDETERMINED * values[-1]:
-        return 0.0
-    root = vectors / np.sqrt(values)
-    return float(np.clip(np.linalg.eigvalsh(root.T @ of_left @ root)[0], 0.0, 1.0))
+def _effect_on_place_m(found: EstimatedMistake, of_place: Array) -> float:
+    if not found.is_seen:
+        return np.inf
+    of_unit = found.by_unknowns @ found.root
+    worst = np.linalg.eigvalsh(of_unit.T @ of_place @ of_unit)[-1]
+    return float(np.sqrt(noncentrality(found.num) * max(worst, 0.0)))
 
 
 def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:

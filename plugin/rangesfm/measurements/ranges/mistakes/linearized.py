@@ -130,7 +130,7 @@ class Linearized(JointProblem):
         A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height
         above a flat path. So a step that makes the state less likely is halved.
         """
-        solved = self.solved(self.noise.covariance_m2)
+        solved = self.solution
 
         def cost(of: Linearized) -> float:
             return float(np.sum(solved.whitened(of.residual[:, None]) ** 2))
@@ -151,12 +151,6 @@ class Linearized(JointProblem):
             if is_nearly_at(problem.on_map, before.on_map, problem.scatter_m):
                 break
         return problem
-
-    @property
-    def misfit(self) -> float:
-        """Squared residuals that the unknowns leave, in standard deviations, with those of the priors."""
-        left = self.solved(self.noise.covariance_m2).residual
-        return float(left @ left)
 
 
 def linearized(on_map: RangesOnMap) -> Linearized:

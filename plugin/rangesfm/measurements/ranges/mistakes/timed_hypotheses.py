@@ -16,7 +16,6 @@ from rangesfm.measurements.ranges.mistakes.hypothesis import (
     duration_s,
     longer,
     longest_m,
-    of_bins,
     too_long,
 )
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
@@ -110,7 +109,7 @@ def _elsewhere(
     def moved(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
         return Hypothesis(
             name,
-            of_bins(problem, -after[:, None] * by_shift),
+            -after[:, None] * by_shift,
             subject=whose,
             words=partial(words, whose, when),
             remedy=remedy,
@@ -137,7 +136,7 @@ def _steps(problem: Linearized, name: str, anchors: Sequence[int]) -> Iterator[H
     def step(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
         return Hypothesis(
             "anchor step" if name else "step",
-            of_bins(problem, -after),
+            -after[:, None],
             subject=name,
             words=partial(words, when),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
@@ -165,7 +164,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
             within = partial(_later, problem, anchors, start, end)
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
-                of_bins(problem, -inside),
+                -inside[:, None],
                 subject=name,
                 words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
@@ -185,7 +184,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     def jump(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
         return Hypothesis(
             "clock jump",
-            of_bins(problem, -by_time * after),
+            -(by_time * after)[:, None],
             words=lambda size: f"the clocks' offset jumped {when}, by about {size[0]:+.2f} s",
             remedy="see whether a logger was restarted then, and run the parts before and after as two surveys",
             correction=lambda size: Correction(time_shift_s=np.where(later(), size[0], 0.0)),

@@ -122,8 +122,7 @@ class RangeScale(KindOnMap):
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""
-        linear, noise = problem.among(problem.is_used)
-        return Posterior.best(linear, noise, self.solved.log_scale_stddev)
+        return problem.posterior(formal=self.solved.log_scale_stddev)
 
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
         """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
@@ -192,7 +191,7 @@ class RangeScale(KindOnMap):
         if not drifts(problem):
             return
         weights, rows = problem.bins.robust_weight, self.solved.posed.rows
-        known = Posterior.best(problem, problem.noise, on_map.posterior.uncertainty.formal)
+        known = problem.posterior(formal=on_map.posterior.uncertainty.formal)
         solved = replace(self.solved, state=bent.state, weights=weights)
         status, stddev_m = told.observations.status.copy(), told.errors.stddev_m.copy()
         status[rows], stddev_m[rows] = status_by_weight(weights), problem.scatter_m
