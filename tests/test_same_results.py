@@ -222,7 +222,7 @@ def site_path(survey: WalkedSurvey) -> Trajectory:
     times = read_image_times_csv(survey.folder / "images.csv").by_name()
     path = trajectory_from_reconstruction(pycolmap.Reconstruction(survey.folder / "sparse" / "0"), times)
     placed = survey.site_from_sfm
-    return path.transformed(placed.scale, placed.rotation, placed.translation)
+    return path.transformed(placed)
 
 
 def write_positions(survey: WalkedSurvey) -> None:

@@ -87,9 +87,7 @@ def test_written_anchors_hold_a_survey_in_their_frame(
     photo_times = read_image_times_csv(walked_survey.folder / "images.csv").by_name()
     model = pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
     placed = walked_survey.site_from_sfm
-    path = trajectory_from_reconstruction(model, photo_times).transformed(
-        placed.scale, placed.rotation, placed.translation
-    )
+    path = trajectory_from_reconstruction(model, photo_times).transformed(placed)
     known = Reference(path.centers, ByTime(path.times_s), path.world_from_cam)
     write_reference(known, tmp_path / "known.csv")
     offset = walked_survey.flags[-1]

@@ -26,6 +26,7 @@ from rangesfm.result.comparison_row import format_table
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -59,14 +60,14 @@ def reference_of(path: Trajectory, *, has_rotations: bool = True) -> Reference:
 def in_first_camera(path: Trajectory) -> Trajectory:
     """Return the path in the frame of its first camera."""
     rotation = path.world_from_cam[0].T
-    return path.transformed(1.0, rotation, -rotation @ path.centers[0])
+    return path.transformed(Similarity(1.0, rotation, -rotation @ path.centers[0]))
 
 
 @pytest.mark.parametrize("percent", [-20.0, 3.0, 250.0])
 def test_a_map_that_is_too_large_has_a_positive_scale_error(percent: float) -> None:
     truth = make_path(*walk())
     rotation = Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
-    path = truth.transformed(1.0 + percent / 100.0, rotation, np.array([3.0, 2.0, 1.0]))
+    path = truth.transformed(Similarity(1.0 + percent / 100.0, rotation, np.array([3.0, 2.0, 1.0])))
     (row,) = compare({"map": path}, reference_of(truth))
     assert row.scale_error_percent == pytest.approx(percent, abs=1e-9)
     assert row.rmse_sim3_m == pytest.approx(0.0, abs=1e-9)
@@ -77,7 +78,9 @@ def test_a_map_that_is_too_large_has_a_positive_scale_error(percent: float) -> N
 
 def test_without_alignment_a_shift_is_an_error_and_after_a_rigid_motion_it_is_not() -> None:
     truth = make_path(*walk())
-    (row,) = compare({"map": truth.transformed(1.0, np.eye(3), np.array([0.3, 0.0, 0.4]))}, reference_of(truth))
+    (row,) = compare(
+        {"map": truth.transformed(Similarity(1.0, np.eye(3), np.array([0.3, 0.0, 0.4])))}, reference_of(truth)
+    )
     assert row.rmse_m == pytest.approx(0.5)
     assert row.rmse_se3_m == pytest.approx(0.0, abs=1e-9)
 
@@ -88,7 +91,7 @@ def test_the_first_camera_frame_is_reached_through_the_references_orientation() 
     (row,) = compare({"map": path}, reference_of(truth), frame="first_camera")
     assert row.rmse_m == pytest.approx(0.0, abs=1e-9)
     (too_large,) = compare(
-        {"map": path.transformed(1.1, np.eye(3), np.zeros(3))}, reference_of(truth), frame="first_camera"
+        {"map": path.transformed(Similarity(1.1, np.eye(3), np.zeros(3)))}, reference_of(truth), frame="first_camera"
     )
     assert too_large.rmse_m == pytest.approx(0.1 * np.sqrt(np.mean(np.sum(path.centers**2, axis=1))))
 
@@ -111,7 +114,7 @@ def test_frames_that_cannot_be_tied_leave_the_unaligned_rmse_out(frame: str | No
 
 def test_true_scale_keeps_the_middle_of_a_site_path_and_the_first_keyframe_of_a_first_camera_path() -> None:
     truth = make_path(*walk())
-    wrong = truth.transformed(0.8, np.eye(3), np.array([1.0, 0.0, 0.0]))
+    wrong = truth.transformed(Similarity(0.8, np.eye(3), np.array([1.0, 0.0, 0.0])))
     in_site = with_true_scale(wrong, reference_of(truth), frame="site")
     np.testing.assert_allclose(in_site.centers.mean(axis=0), wrong.centers.mean(axis=0))
     in_camera = with_true_scale(wrong, reference_of(truth), frame="first_camera")
@@ -141,7 +144,7 @@ def test_the_papers_table_separates_the_error_of_the_scale_from_that_of_the_shap
 
 def test_a_straight_path_still_tells_its_scale() -> None:
     truth = make_path(np.outer(np.arange(10.0), [1.0, 2.0, 2.0]))
-    (row,) = compare({"map": truth.transformed(1.02, np.eye(3), np.ones(3))}, reference_of(truth))
+    (row,) = compare({"map": truth.transformed(Similarity(1.02, np.eye(3), np.ones(3)))}, reference_of(truth))
     assert row.scale_error_percent == pytest.approx(2.0, abs=1e-6)
     assert row.rmse_sim3_m == pytest.approx(0.0, abs=1e-6)
 

@@ -48,7 +48,7 @@ def estimate(walked: Survey) -> ScaleEstimate:
 
 def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Trajectory:
     moved = estimate.metric_from_sfm
-    return walked.trajectory.transformed(moved.scale, moved.rotation, moved.translation)
+    return walked.trajectory.transformed(moved)
 
 
 @pytest.mark.parametrize("seed", range(2))

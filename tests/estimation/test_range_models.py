@@ -47,7 +47,7 @@ class Scene:
         metric = trajectory_from_reconstruction(chain.reconstruction, chain.timestamps_s)
         self.metric_from_sfm = Similarity(2.3, Rotation.random(random_state=3).as_matrix(), rng.normal(size=3))
         back = self.metric_from_sfm.inverse()
-        sfm = metric.transformed(back.scale, back.rotation, back.translation)
+        sfm = metric.transformed(back)
         self.tag_in_cam_m, num = rng.normal(0, 0.3, 3), 24
         self.anchors_m, self.biases_m = metric.centers[:3] + rng.normal(0, 6, (3, 3)), rng.normal(0, 0.2, 3)
         self.anchors = tuple(

@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import Command, WalkedSurvey
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds
 from rangesfm.measurements.kind import Doubt
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
@@ -22,6 +22,7 @@ from rangesfm.solver.posterior import Observations, ScaleUncertainty
 from rangesfm.survey import kinds_in_map
 from rangesfm.survey.kinds_in_map import MapOfPhotos
 from rangesfm.util.geometry.similarity import Similarity, align_points
+from rangesfm.util.geometry.trajectory import first_camera_from
 
 STEPS, STEPS_STDDEV_M = "steps", 0.02
 SAID = "a step counter does not know how long a step is"
@@ -47,7 +48,7 @@ class Steps(KindOnMap):
     @property
     def start(self) -> Similarity:
         scales = self.distance_m / np.linalg.norm(self.away, axis=1)
-        return in_first_cameras_frame(self.at.path, float(np.median(scales)))
+        return first_camera_from(self.at.path, float(np.median(scales)))
 
     @cached_property
     def alone(self) -> JointMap:

@@ -322,9 +322,7 @@ def bent(path: CameraPath, rng: np.random.Generator) -> Trajectory:
     moved = centers + np.column_stack([np.interp(times, knots, bend[:, k]) for k in range(3)])
     names = tuple(f"{k:04d}.jpg" for k in range(len(times)))
     of_map = in_world_of_its_own(rng)
-    return Trajectory(np.arange(1, len(times) + 1), names, times, moved, rotations).transformed(
-        of_map.scale, of_map.rotation, of_map.translation
-    )
+    return Trajectory(np.arange(1, len(times) + 1), names, times, moved, rotations).transformed(of_map)
 
 
 # The ranges, and whole surveys.

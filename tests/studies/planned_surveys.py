@@ -165,7 +165,7 @@ def measured(
     log = replace(log, range_m=ranges_m, shared_stddev_m=curve)
     bent = replace(true, centers=true.centers + stddevs["bending"] * _bend(times, rng))
     of_map = in_world_of_its_own(rng)
-    seen = bent.transformed(of_map.scale, of_map.rotation, of_map.translation)
+    seen = bent.transformed(of_map)
     return associate(log, seen, planned.tag_in_cam_m), seen, _told(planned, rng), _taped(planned, rng)
 
 

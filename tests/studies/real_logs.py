@@ -47,7 +47,7 @@ from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import RangesOptions, ScaleOptions
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.reference import Reference, read_reference
-from rangesfm.util.geometry.similarity import rmse
+from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
@@ -132,7 +132,7 @@ def path_of(reference: Reference) -> Trajectory:
 
 
 def turned(path: Trajectory, seed: int) -> Trajectory:
-    return path.transformed(1.0, Rotation.random(random_state=seed).as_matrix(), np.array([3.0, -2.0, 1.0]))
+    return path.transformed(Similarity(1.0, Rotation.random(random_state=seed).as_matrix(), np.array([3.0, -2.0, 1.0])))
 
 
 def cases(log: RangeLog, anchors: list[Anchor], path: Trajectory) -> Iterator[Case]:

@@ -32,10 +32,7 @@ def ids_seen_in(image: pycolmap.Image) -> Indices:
 
 def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
     """Return the sparse matrix (n, n) of the numbers of points that pairs of the n registered photos both see."""
-    photos = [ids_seen_in(model.image(image_id)) for image_id in model.reg_image_ids()]
-    starts = np.cumsum([0, *map(len, photos)])
-    of_point = np.unique(np.concatenate(photos), return_inverse=True)[1]
-    sees = csr_array((np.ones(len(of_point)), of_point, starts), shape=(len(photos), int(of_point.max(initial=-1)) + 1))
+    sees = _sees(model, np.arange(model.num_reg_images()))
     return csr_array(sees @ sees.T)
 
 
@@ -60,10 +57,10 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
     """
     frame_ids, sees, labels = _parts(model)
     num_frames = np.bincount(labels, minlength=1)
-    largest, names = num_frames.argmax(), _names_of_frames(model, frame_ids)
+    largest = num_frames.argmax()
     return tuple(
         LoosePiece(
-            tuple(sorted(name for k in np.flatnonzero(labels == part) for name in names[k])),
+            tuple(sorted(_names_in(model, frame_ids[labels == part]))),
             int(_shared_by_parts(sees, (labels == part).astype(np.int64))[0, 1]),
         )
         for part in np.flatnonzero(num_frames > 1).tolist()
@@ -88,7 +85,8 @@ def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]
     Parts are merged as long as two of them share enough points. A model without points is one part.
     """
     frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
-    sees = _frames_see(model, frame_ids)
+    frame_of = [model.image(image_id).frame_id for image_id in model.reg_image_ids()]
+    sees = _sees(model, np.searchsorted(frame_ids, frame_of))
     if not sees.shape[1]:
         return frame_ids, sees, np.zeros(len(frame_ids), dtype=np.int64)
     labels = np.arange(len(frame_ids))
@@ -103,17 +101,17 @@ def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]
             return frame_ids, sees, labels
 
 
-def _frames_see(model: pycolmap.Reconstruction, frame_ids: Indices) -> csr_array:
-    """Return the sparse matrix (f, p) of which of p points each of f frames sees: positive where it does."""
-    row_of = {frame_id: row for row, frame_id in enumerate(frame_ids.tolist())}
-    rows, points = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        ids = ids_seen_in(image)
-        points.append(ids)
-        rows.append(np.full(len(ids), row_of[image.frame_id], dtype=np.int64))
-    row, (unique, column) = np.concatenate(rows), np.unique(np.concatenate(points), return_inverse=True)
-    return coo_array((np.ones(len(row)), (row, column)), shape=(len(frame_ids), len(unique))).tocsr()
+def _sees(model: pycolmap.Reconstruction, row_of_photo: Indices) -> csr_array:
+    """Return the sparse matrix (k, p) of how often each row sees each of p points.
+
+    Args:
+        row_of_photo: row of each registered photo, in their order.
+    """
+    photos = [ids_seen_in(model.image(image_id)) for image_id in model.reg_image_ids()]
+    row = np.repeat(row_of_photo, [*map(len, photos)])
+    unique, column = np.unique(np.concatenate([*photos, np.zeros(0, dtype=np.int64)]), return_inverse=True)
+    num_rows = int(row_of_photo.max(initial=-1)) + 1
+    return coo_array((np.ones(len(row)), (row, column)), shape=(num_rows, len(unique))).tocsr()
 
 
 def _shared_by_parts(sees: csr_array, labels: Indices) -> csr_array:
@@ -124,9 +122,7 @@ def _shared_by_parts(sees: csr_array, labels: Indices) -> csr_array:
     return csr_array(by_part @ by_part.T)
 
 
-def _names_of_frames(model: pycolmap.Reconstruction, frame_ids: Indices) -> list[list[str]]:
-    names: dict[int, list[str]] = {frame_id: [] for frame_id in frame_ids.tolist()}
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        names[image.frame_id].append(image.name)
-    return list(names.values())
+def _names_in(model: pycolmap.Reconstruction, frame_ids: Indices) -> list[str]:
+    """Return the names of the photos of some frames."""
+    frames = map(model.frame, frame_ids.tolist())
+    return [model.image(data_id.id).name for frame in frames for data_id in frame.image_ids]

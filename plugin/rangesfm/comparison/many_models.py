@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, rms
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import NO_RANGES, ModelRanges, ranges_of_result
-from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
+from rangesfm.comparison.same_photos import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
@@ -89,7 +89,7 @@ class ModelRow:
     def aligned(self) -> Trajectory:
         """Return the path after that similarity, or as it is without one."""
         path = self.model.path
-        return path if self.base_from_model is None else carried_by(self.base_from_model, path)
+        return path if self.base_from_model is None else path.transformed(self.base_from_model)
 
     @property
     def scale_ratio(self) -> float:
@@ -225,7 +225,7 @@ def compare_many(
         range_rms_m = _NOT_KNOWN
         if onto is not None and model.has_orientations:
             as_it_is = rms((own_ranges or ranges).residuals_m(model.path))
-            carried = rms(ranges.residuals_m(carried_by(onto, model.path)))
+            carried = rms(ranges.residuals_m(model.path.transformed(onto)))
             range_rms_m = _NOT_KNOWN if np.isnan(as_it_is) else (as_it_is, carried)
         rows.append(_row(models[0], model, range_rms_m))
     taped = _taped(models, ranges, onto_ranges, tape)

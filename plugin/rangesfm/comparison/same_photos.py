@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.util.geometry.similarity import Similarity, rmse
+from rangesfm.util.geometry.similarity import rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Length = tuple[str, str, tuple[float, ...]]
@@ -21,11 +21,6 @@ def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...
     rows = [(i, index[name]) for i, name in enumerate(first.image_names) if name in index]
     ours, theirs = np.array(rows, dtype=np.int64).reshape(-1, 2).T
     return tuple(first.image_names[i] for i in ours), first.centers[ours], second.centers[theirs]
-
-
-def carried_by(similarity: Similarity, path: Trajectory) -> Trajectory:
-    """Return a path transformed by a similarity."""
-    return path.transformed(similarity.scale, similarity.rotation, similarity.translation)
 
 
 def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:

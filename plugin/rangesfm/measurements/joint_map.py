@@ -27,8 +27,8 @@ from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity
-from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -433,8 +433,3 @@ def place_first(kinds: Sequence[KindOnMap]) -> KindOnMap:
 def upward_by(kinds: Sequence[KindOnMap], given: Gravity | None) -> Gravity | None:
     """Return the upward direction in the first camera as the first kind has it that tells it, or else as given."""
     return next((upward for each in kinds if (upward := each.upward) is not None), given)
-
-
-def in_first_cameras_frame(path: Trajectory, scale: float) -> Similarity:
-    """Return the placement of a map in the frame of its first camera, given the metres per unit of its path."""
-    return replace(IDENTITY, scale=scale) @ first_camera_from(path)

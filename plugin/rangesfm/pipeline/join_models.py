@@ -126,10 +126,7 @@ def assembled(
     """Return all models and paths as one, in the world of the first; ``is_of_one_database`` as for ``joined_model``."""
     if len(parts) == 1:
         return parts[0]
-    moved = [
-        part.trajectory.transformed(motion.scale, motion.rotation, motion.translation)
-        for part, motion in zip(parts, first_from_sfm, strict=True)
-    ]
+    moved = [part.trajectory.transformed(motion) for part, motion in zip(parts, first_from_sfm, strict=True)]
     trajectory, keyframes = joined_trajectory(moved)
     observations = joined_observations([part.observations for part in parts], first_from_sfm, keyframes)
     moved_models = [rescale(part.sfm, motion) for part, motion in zip(parts, first_from_sfm, strict=True)]

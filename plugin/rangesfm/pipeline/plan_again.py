@@ -23,6 +23,7 @@ from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 
 # Assumed rate of photos without times.
@@ -139,7 +140,7 @@ def _levelled(of_run: PlannedSurvey, points_m: Array, num_ranges: int, upward: A
     else:
         level = level_axes(of_run.trajectory, up_in_world(of_run.trajectory, "auto", upward))
         anchors = tuple(replace(a, position_m=level @ np.array(a.position_m)) for a in of_run.anchors)
-        path = of_run.trajectory.transformed(1.0, level, np.zeros(3))
+        path = of_run.trajectory.transformed(Similarity(1.0, level, np.zeros(3)))
         planned = replace(of_run, trajectory=path, anchors=anchors, site=Site(), axes=_AXES, level=_LEVEL)
     return _inside(planned.ranging(num_ranges) if planned.anchors else planned, points_m @ level.T)
 

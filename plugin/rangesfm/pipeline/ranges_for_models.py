@@ -47,6 +47,6 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
         anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
         image_times_s=times,
-        metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation),
+        metric_path=metric.trajectory.transformed(scaled),
         association=run.survey.ranges,
     )

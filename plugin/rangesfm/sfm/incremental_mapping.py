@@ -85,7 +85,7 @@ def incremental_mapping(
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)
     token, begin_s = cancellation_token or pycolmap.CancellationToken(), time.monotonic()
-    adjustments = _WholeAdjustments(pipeline.options)
+    adjustments = _WholeAdjustments(pipeline)
     left = [] if unfinished is None else [unfinished]
 
     def models() -> list[pycolmap.Reconstruction]:
@@ -125,11 +125,12 @@ class _WholeAdjustments:
     have been without the interruption.
 
     Args:
-        options: of a pipeline, which reads them again after each photo.
+        pipeline: reads its options again after each photo.
     """
 
-    def __init__(self, options: pycolmap.IncrementalPipelineOptions):
-        self._options = options
+    def __init__(self, pipeline: pycolmap.IncrementalPipeline):
+        self._pipeline = pipeline
+        options = pipeline.options
         self._ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
         self._steps = options.ba_global_frames_freq, options.ba_global_points_freq
         self._counted_from: Size = (0, 0)
@@ -149,17 +150,14 @@ class _WholeAdjustments:
 
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
         """Note whether the model has been adjusted, by COLMAP's rule."""
-        options, now = self._options, size_of(model)
-        ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
-        steps = options.ba_global_frames_freq, options.ba_global_points_freq
-        counts = zip(now, self._counted_from, ratios, steps, strict=True)
-        if any(num >= min(ratio * before, before + step) for num, before, ratio, step in counts):
-            self.size_at_last = self._counted_from = now
+        if self._pipeline.check_run_global_refinement(model, *self._counted_from):
+            self.size_at_last = self._counted_from = size_of(model)
             self._count(self._ratios, self._steps)
 
     def _count(self, ratios: tuple[float, float], steps: tuple[int, int]) -> None:
-        self._options.ba_global_frames_ratio, self._options.ba_global_points_ratio = ratios
-        self._options.ba_global_frames_freq, self._options.ba_global_points_freq = steps
+        options = self._pipeline.options
+        options.ba_global_frames_ratio, options.ba_global_points_ratio = ratios
+        options.ba_global_frames_freq, options.ba_global_points_freq = steps
 
 
 def adjust_whole(

@@ -48,7 +48,13 @@ def read_photo_list(
     if not columns and PHOTO_TIMES.is_canonical(read_head(path)):
         unit = unit or "s"
     times_s, unit, notes = times_by_row(table, PHOTO_TIMES.what, unit, "image_times_unit")
-    return _with_resolution(replace(table, notes=(*table.notes, *notes)), times_s, unit)
+    if not len(table):
+        raise InputError("no rows below the header, expected one per photo", path)
+    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in table.text("timestamp")]
+    resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
+    if "nanoseconds" in table:
+        resolution_s[:] = SECONDS_PER_UNIT["ns"]
+    return replace(table, notes=(*table.notes, *notes)), times_s, resolution_s
 
 
 def find_photo_columns(form: TableForm, path: Path, layout: Layout) -> dict[str, str] | None:
@@ -89,13 +95,3 @@ PHOTO_TIMES = TableForm(
     "image_times_columns",
     also=("date", "nanoseconds"),
 )
-
-
-def _with_resolution(table: TextTable, times_s: Array, unit: str) -> tuple[TextTable, Array, Array]:
-    if not len(table):
-        raise InputError("no rows below the header, expected one per photo", table.path)
-    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in table.text("timestamp")]
-    resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
-    if "nanoseconds" in table:
-        resolution_s[:] = SECONDS_PER_UNIT["ns"]
-    return table, times_s, resolution_s

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.solver.noise import Component
-from rangesfm.util.geometry.similarity import align_points, similarity_motions
+from rangesfm.util.geometry.similarity import Similarity, align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 BENDS = {
@@ -232,8 +232,8 @@ class WalkBending:
         away = align_points(given.centers, bent.centers)
         if self.frame_is_free:
             back = away.inverse()
-            return bent.transformed(back.scale, back.rotation, back.translation)
-        return bent.transformed(1 / away.scale, np.eye(3), (1 - 1 / away.scale) * bent.centers[0])
+            return bent.transformed(back)
+        return bent.transformed(Similarity(1 / away.scale, np.eye(3), (1 - 1 / away.scale) * bent.centers[0]))
 
 
 def bent_path(path: Trajectory, starts: Indices, steps: Array) -> Trajectory:

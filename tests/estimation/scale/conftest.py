@@ -156,7 +156,7 @@ def _make_survey(
     site_path = Trajectory(np.arange(1, num_keyframes + 1), names, times, centers, world_from_cam)
     poses = np.repeat(np.arange(num_keyframes), num_epochs)
     return Survey(
-        site_path.transformed(inverse.scale, inverse.rotation, inverse.translation),
+        site_path.transformed(inverse),
         site_from_sfm,
         times,
         centers,

@@ -195,7 +195,7 @@ class TestRefused:
     def test_a_camera_that_stands_still_far_from_the_origin_of_its_world(self, make_survey: MakeSurvey) -> None:
         """There, rounding spreads its centres over nanometres."""
         survey = make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1)))
-        shaken = survey.trajectory.transformed(1.0, np.eye(3), np.full(3, 1e7))
+        shaken = survey.trajectory.transformed(Similarity(1.0, np.eye(3), np.full(3, 1e7)))
         shaken.centers[:] += np.random.default_rng(0).choice([-2e-9, 0.0, 2e-9], (40, 3))
         self.refuse(replace(survey, trajectory=shaken), "first_camera", "ABCDE", "no scale explains")
 

@@ -15,6 +15,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.association import associate
+from rangesfm.util.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from tests.estimation.scale.conftest import MakeSurvey, Survey
@@ -46,14 +47,14 @@ def assert_same(found: ScaleEstimate, expected: ScaleEstimate, factor: float = 1
 @a_few
 def test_any_unit_of_the_map_will_do(survey: Survey, exponent: float) -> None:
     unit = 10.0**exponent
-    smaller = replace(survey, trajectory=survey.trajectory.transformed(1 / unit, np.eye(3), np.zeros(3)))
+    smaller = replace(survey, trajectory=survey.trajectory.transformed(Similarity(1 / unit, np.eye(3), np.zeros(3))))
     assert_same(estimate(smaller), estimate(survey), unit)
 
 
 @given(origin=st.tuples(*[st.floats(-1e7, 1e7)] * 3))
 @a_few
 def test_the_origin_of_the_map_may_be_10_000_km_away(survey: Survey, origin: tuple[float, float, float]) -> None:
-    away = replace(survey, trajectory=survey.trajectory.transformed(1.0, np.eye(3), np.array(origin)))
+    away = replace(survey, trajectory=survey.trajectory.transformed(Similarity(1.0, np.eye(3), np.array(origin))))
     found, expected = estimate(away), estimate(survey)
     # Coordinates have a resolution of 2e-9 there, which limits the accuracy.
     assert found.value == pytest.approx(expected.value, rel=1e-7)

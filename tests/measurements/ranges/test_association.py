@@ -15,6 +15,7 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.options import RangesOptions
+from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
@@ -150,7 +151,7 @@ class TestBetweenKeyframes:
         rotation = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
         log = log_at(np.linspace(0.0, 19.0, 50))
         found = associate(log, path, TAG_IN_CAM_M)
-        moved = associate(log, path.transformed(100.0, rotation, np.ones(3)), TAG_IN_CAM_M)
+        moved = associate(log, path.transformed(Similarity(100.0, rotation, np.ones(3))), TAG_IN_CAM_M)
         np.testing.assert_allclose(moved.centers, 100.0 * found.centers @ rotation.T + 1.0, atol=1e-9)
         np.testing.assert_allclose(moved.tag_from_center, found.tag_from_center @ rotation.T, atol=1e-12)
         np.testing.assert_allclose(moved.center_stddev, 100.0 * found.center_stddev, atol=1e-9)

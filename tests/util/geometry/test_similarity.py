@@ -87,7 +87,7 @@ def test_a_moved_trajectory_sees_the_same_points(rng: np.random.Generator) -> No
     truth = random_similarity(rng, 3.0)
     world_from_cam = Rotation.from_quat(rng.normal(size=(4, 4))).as_matrix()
     path = Trajectory(np.arange(4), ("a", "b", "c", "d"), None, rng.normal(size=(4, 3)), world_from_cam)
-    moved = path.transformed(truth.scale, truth.rotation, truth.translation)
+    moved = path.transformed(truth)
     point = rng.normal(size=3)
     in_cam = np.einsum("nji,nj->ni", path.world_from_cam, point - path.centers)
     still_in_cam = np.einsum("nji,nj->ni", moved.world_from_cam, truth.apply(point) - moved.centers)

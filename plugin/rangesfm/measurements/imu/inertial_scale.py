@@ -35,7 +35,7 @@ from rangesfm.measurements.imu.preintegration import (
     Preintegrated,
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.ranges.errors.components import component_words
@@ -47,6 +47,7 @@ from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, S
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import first_camera_from
 
 IMU = "imu"
 # Observations from which the sizes of errors are learnt before there are other kinds.
@@ -84,7 +85,7 @@ class InertialScale(KindOnMap):
     @property
     def start(self) -> Similarity:
         """The placement by the log alone, in the first camera's frame."""
-        return in_first_cameras_frame(self.problem.path, self.state.scale)
+        return first_camera_from(self.problem.path, self.state.scale)
 
     @cached_property
     def alone(self) -> JointMap:

@@ -15,7 +15,6 @@ from rangesfm.measurements.joint_map import (
     JointMap,
     KindOnMap,
     fit_kinds,
-    in_first_cameras_frame,
     most_contradicting,
 )
 from rangesfm.measurements.kind import Doubt
@@ -29,7 +28,7 @@ from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity, path_shape
-from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from
 
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
@@ -74,7 +73,7 @@ class LengthScale(KindOnMap):
     def start(self) -> Similarity:
         """The placement with the median of the scales by the kept lengths."""
         scales = self.lengths.distance_m / self.lengths.model_length
-        return in_first_cameras_frame(self.path, float(np.median(scales[self.is_kept])))
+        return first_camera_from(self.path, float(np.median(scales[self.is_kept])))
 
     @cached_property
     def alone(self) -> JointMap:

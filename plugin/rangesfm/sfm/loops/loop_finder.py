@@ -159,12 +159,12 @@ class LoopFinder:
         before = pose_of(self.model.frame(image.frame_id))
         after = (image.cam_from_world() * before.inverse()).inverse() * cam_from_world
         from_map = after.rotation.matrix().T @ before.rotation.matrix()
-        shift = _center(after) - _center(before)
+        shift = after.tgt_origin_in_src() - before.tgt_origin_in_src()
         world_from_cam = cam_from_world.rotation.matrix().T
-        row, from_camera = self.views.row_of[photos[1]], points[fits] - _center(cam_from_world)
+        row, from_camera = self.views.row_of[photos[1]], points[fits] - cam_from_world.tgt_origin_in_src()
         by_point = _pixels_by_points(from_camera, world_from_cam[None], self.views.focal_px[row])
         residuals_px = np.asarray(camera.img_from_cam(from_camera @ world_from_cam)) - pixels[fits]
-        by_part, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, _center(after))
+        by_part, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, after.tgt_origin_in_src())
 
         def covariance(frame_id: int, by_own: Array) -> Array:
             """Return the (6, 6) covariance of the pose by the points against what depends on another keyframe."""
@@ -239,10 +239,6 @@ class LoopFinder:
         by_frame = (adder @ by_seen.reshape(-1, 36)).reshape(-1, 6, 6)
         ids_of_frames = self.path.frame_ids[frames].tolist()
         return {("frame", id_): by for id_, by in zip(ids_of_frames, by_frame, strict=True)}, variance * covariance
-
-
-def _center(rig_from_world: pycolmap.Rigid3d) -> Array:
-    return np.asarray(-rig_from_world.rotation.matrix().T @ rig_from_world.translation)
 
 
 def _pixels_by_points(from_camera: Array, world_from_cam: Array, focal_px: Array) -> Array:

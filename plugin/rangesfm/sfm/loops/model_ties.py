@@ -107,14 +107,13 @@ class _MatchedPoints:
         if (found := resect(self.pixels[1], self.in_first, self.cameras[1], seed)) is None:
             return None
         cam_from_first, fits = found
-        to_first = cam_from_first.rotation.matrix().T
-        center, own_center = -to_first @ cam_from_first.translation, self.photos[1].projection_center()
+        center, own_center = cam_from_first.tgt_origin_in_src(), self.photos[1].projection_center()
         lengths, own_lengths = (
             np.linalg.norm(points[fits] - at, axis=1)
             for points, at in ((self.in_first, center), (self.in_second, own_center))
         )
         scale = float(np.median(lengths / own_lengths))
-        rotation = to_first @ self.photos[1].cam_from_world().rotation.matrix()
+        rotation = cam_from_first.rotation.matrix().T @ self.photos[1].cam_from_world().rotation.matrix()
         return Similarity(scale, rotation, center - scale * rotation @ own_center)
 
     def agree(self, first_from_second: Similarity) -> Mask:

@@ -12,7 +12,7 @@ from rangesfm.estimation.vision_information import Loop
 from rangesfm.sfm.loop_database import LoopMatching, Pair
 from rangesfm.sfm.loops.loop_finder import LoopFinder
 from rangesfm.sfm.photos_alike import pairs_alike
-from rangesfm.util.geometry.similarity import rmse
+from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
 MAX_NUM_PAIRS = 5
@@ -49,7 +49,7 @@ class LoopClosure:
 
     def moved(self, offset_m: Array) -> LoopClosure:
         """Return the same in a world whose coordinates are larger by ``offset_m`` (3,)."""
-        return replace(self, before=self.before.transformed(1.0, np.eye(3), offset_m))
+        return replace(self, before=self.before.transformed(Similarity(1.0, np.eye(3), offset_m)))
 
 
 def find_loops(

@@ -10,6 +10,7 @@ from pathlib import Path
 from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions
 from rangesfm.progress import Progress
+from rangesfm.sfm.photo_files import MIN_NUM_PHOTOS
 from rangesfm.survey.sources.source import Frame, PhotoSource, open_source
 from rangesfm.util.files.atomic import new_folder
 from rangesfm.util.files.contents import state_and_sha256
@@ -19,7 +20,6 @@ from rangesfm.util.files.text_tables import write_table
 TIMES_NAME = "images.csv"
 RECORD_NAME = "photos.json"
 """File in a folder of extracted photos that records their source."""
-_MIN_NUM_PHOTOS = 2
 _ROUNDING = 1e-6  # tolerance, as a fraction of an interval, for times that are rounded down below its start
 _Files = dict[str, tuple[tuple[int, int, int], str]]
 
@@ -73,8 +73,8 @@ def take_photos(
     source = open_source(path, topic)
     with new_folder(folder) as new:
         times_s, num_bytes = _write(source, new, rate_hz, progress)
-        if len(times_s) < _MIN_NUM_PHOTOS:
-            raise InputError(f"fewer than {_MIN_NUM_PHOTOS} photos at {rate_hz:g} Hz ([images] rate_hz)", path)
+        if len(times_s) < MIN_NUM_PHOTOS:
+            raise InputError(f"fewer than {MIN_NUM_PHOTOS} photos at {rate_hz:g} Hz ([images] rate_hz)", path)
         what = f"the photos are the sharpest of each {1 / rate_hz:.3g} s of {path.name}; their times are {source.clock}"
         found = {"image_names": tuple(times_s), "camera": source.camera, "notes": (what, *source.notes)}
         taken = wanted.model_copy(update=found)

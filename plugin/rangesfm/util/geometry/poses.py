@@ -44,5 +44,4 @@ def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Po
     """Return the poses of the given frames."""
     rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
     world_from_rig = np.array([pose.rotation.matrix().T for pose in rigid])
-    translations = np.array([pose.translation for pose in rigid])
-    return Poses(world_from_rig, -np.einsum("nij,nj->ni", world_from_rig, translations))
+    return Poses(world_from_rig, np.array([pose.tgt_origin_in_src() for pose in rigid]))

@@ -100,14 +100,14 @@ class Reference:
             times_s, known_s = moments.timestamp_s, self.moments.timestamp_s
             at = places_in_time(times_s, known_s, max_gap_s=max_gap_s, max_difference_s=MAX_TIME_DIFFERENCE_S)
         is_known, positions = at.before >= 0, np.full((len(moments), 3), np.nan)
-        before, after, fraction = at.before[is_known], at.after[is_known], at.fraction[is_known, None]
-        positions[is_known] = (1 - fraction) * self.positions_m[before] + fraction * self.positions_m[after]
+        at = at.subset(is_known)
+        positions[is_known] = at.between(self.positions_m)
         if self.world_from_cam is None:
             return positions, None
         rotations = np.full((len(moments), 3, 3), np.nan)
-        if len(before):  # SciPy before 1.16 cannot make an empty set of rotations
-            start, end = (Rotation.from_matrix(self.world_from_cam[index]) for index in (before, after))
-            turned = start * Rotation.from_rotvec(fraction * (start.inv() * end).as_rotvec())
+        if len(at.before):  # SciPy before 1.16 cannot make an empty set of rotations
+            start, end = (Rotation.from_matrix(self.world_from_cam[index]) for index in (at.before, at.after))
+            turned = start * Rotation.from_rotvec(at.fraction[:, None] * (start.inv() * end).as_rotvec())
             rotations[is_known] = turned.as_matrix()
         return positions, rotations
 

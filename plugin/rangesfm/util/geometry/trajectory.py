@@ -47,10 +47,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.image_names)
 
-    def transformed(self, scale: float, rotation: Array, translation: Array) -> Trajectory:
-        """Return the path in the world ``x_new = scale * rotation @ x + translation``."""
-        centers = scale * self.centers @ rotation.T + translation
-        return replace(self, centers=centers, world_from_cam=rotation @ self.world_from_cam)
+    def transformed(self, new_from_old: Similarity) -> Trajectory:
+        """Return the path in another world."""
+        turned = new_from_old.rotation @ self.world_from_cam
+        return replace(self, centers=new_from_old.apply(self.centers), world_from_cam=turned)
 
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
         """Return the path of the same keyframes in another model."""
@@ -88,7 +88,7 @@ class Trajectory:
         is the mean of the path, because ranges to surveyed anchors determine that point whatever the scale.
         """
         fixed_point = self.centers[0] if frame == "first_camera" else self.centers.mean(axis=0)
-        return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
+        return self.transformed(Similarity(factor, np.eye(3), (1.0 - factor) * fixed_point))
 
 
 @dataclass(frozen=True)
@@ -158,14 +158,13 @@ def places_in_time(times: Array, keyframe_times: Array, *, max_gap_s: float, max
 
 def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
     """Return a path in the frame of its first pose, in a new unit that is ``unit`` times its own."""
-    turn = trajectory.world_from_cam[0].T
-    return trajectory.transformed(1 / unit, turn, -turn @ trajectory.centers[0] / unit)
+    return trajectory.transformed(first_camera_from(trajectory, 1 / unit))
 
 
-def first_camera_from(trajectory: Trajectory) -> Similarity:
-    """Return the rigid motion from the world of a path to the frame of its first camera."""
+def first_camera_from(trajectory: Trajectory, scale: float = 1.0) -> Similarity:
+    """Return the similarity, a rigid motion by default, from the world of a path to the frame of its first camera."""
     rotation = trajectory.world_from_cam[0].T
-    return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
+    return Similarity(scale, rotation, -scale * rotation @ trajectory.centers[0])
 
 
 def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
@@ -196,10 +195,8 @@ def trajectory_from_reconstruction(
         name = _reference_image_name(reconstruction, frame)
         time = 0.0 if timestamps_s is None else timestamps_s.get(name)
         if time is not None:
-            rig_from_world = pose_of(frame)
-            world_from_cam = rig_from_world.rotation.matrix().T
-            center = -world_from_cam @ rig_from_world.translation
-            rows.append((time, name, frame_id, center, world_from_cam))
+            pose = pose_of(frame)
+            rows.append((time, name, frame_id, pose.tgt_origin_in_src(), pose.rotation.matrix().T))
     rows.sort(key=lambda row: row[:2])
     times, names, frame_ids, centers, turns = zip(*rows) if rows else ((),) * 5
     return Trajectory(

@@ -39,7 +39,7 @@ from rangesfm.solver.bending import NO_STEPS, FrameSteps
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Posterior, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity, rmse
+from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from
 
 
@@ -88,8 +88,7 @@ class RangeScale(KindOnMap):
     @property
     def start(self) -> Similarity:
         """The placement of the solution."""
-        unit = replace(IDENTITY, scale=self.unit)
-        return self.solved.state.metric_from_model @ unit @ first_camera_from(self.path)
+        return self.solved.state.metric_from_model @ first_camera_from(self.path, self.unit)
 
     @cached_property
     def alone(self) -> JointMap:

@@ -24,7 +24,7 @@ from rangesfm.measurements.ranges.scale.solution import solution_from, solve_sca
 from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import Gravity
-from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
 
 
@@ -107,16 +107,17 @@ class RangesAtRest(Located):
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges where the map has them."""
         path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.solved.posed
-        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
-        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
+        unit, trajectory = 1 / scale, path.transformed(Similarity(1 / scale, np.eye(3), np.zeros(3)))
+        # The model's frame is that of the first camera, in the unit of the unscaled model.
+        model_from_metric = first_camera_from(path, unit)
+        placed = model_from_metric.inverse()
         tags_m, centers_m = ranges.antennas_m(self.state)
         problem = replace(
             posed.ranges,
-            centers=placed.inverse().apply(centers_m),
+            centers=model_from_metric.apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
             distances=with_lengths(posed.ranges.distances, others, scale),
-            # The model's frame is that of the first camera, in the unit of the unscaled model.
-            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
+            placement=placement_by(others, model_from_metric),
         )
         turns, velocity = turns_and_velocities(posed.observations, posed.rows, trajectory)
         given = replace(posed.given, trajectory=trajectory, bending=self.bending)
