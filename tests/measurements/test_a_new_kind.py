@@ -14,8 +14,10 @@ import pytest
 from tests.conftest import Command, WalkedSurvey
 
 from rangesfm.arrays import Array
+from rangesfm.measurements import kinds_in_words
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds
 from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.kind_words import KindWords
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations, ScaleUncertainty
@@ -88,7 +90,9 @@ def counted(walked_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch) -> dic
         true_m = np.linalg.norm(np.diff([by_photo[name] for name in at.path.image_names], axis=0), axis=1)
         return Steps(factor["longer"] * true_m + noise_m, at)
 
-    monkeypatch.setitem(kinds_in_map.KINDS, STEPS, locate)
+    row = kinds_in_map.Kind(KindWords(STEPS, "counted steps", {STEPS: "noise of the counted steps"}), locate)
+    monkeypatch.setattr(kinds_in_map, "KINDS", (*kinds_in_map.KINDS, row))
+    monkeypatch.setattr(kinds_in_words, "KINDS_IN_WORDS", (*kinds_in_words.KINDS_IN_WORDS, row.words))
     return factor
 
 

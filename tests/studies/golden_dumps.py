@@ -51,8 +51,8 @@ from tests.studies.measured_distances import KINDS
 import rangesfm
 from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.length_scale import LengthScale
-from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale
+from rangesfm.measurements.positions.words import POSITIONS
 from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale

@@ -20,6 +20,7 @@ from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.positions.control_points import locate_points
+from rangesfm.measurements.positions.entry import PointErrors3d, PointRow, PointsEntry
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
 from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
@@ -193,7 +194,7 @@ def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
     )
 
 
-def points_entry(found: MetricResult) -> entries.PointsEntry | None:
+def points_entry(found: MetricResult) -> PointsEntry | None:
     """Return control and check points in the final map; None without any, or where the map is not in the site."""
     known = found.inputs.positions.points
     if not known.points or found.estimate.frame != "site":
@@ -205,7 +206,7 @@ def points_entry(found: MetricResult) -> entries.PointsEntry | None:
         at = places.get(point.name)
         off = None if at is None else at - point.position_m
         rows.append(
-            entries.PointRow(
+            PointRow(
                 marker=point.name,
                 kind=point.kind,
                 known_m=point.position_m.tolist(),
@@ -215,15 +216,15 @@ def points_entry(found: MetricResult) -> entries.PointsEntry | None:
                 distance_m=None if off is None else float(np.linalg.norm(off)),
             )
         )
-    return entries.PointsEntry(control=_rmse(rows, CONTROL), check=_rmse(rows, CHECK), points=tuple(rows))
+    return PointsEntry(control=_rmse(rows, CONTROL), check=_rmse(rows, CHECK), points=tuple(rows))
 
 
-def _rmse(rows: Sequence[entries.PointRow], kind: str) -> entries.PointErrors3d:
+def _rmse(rows: Sequence[PointRow], kind: str) -> PointErrors3d:
     off = np.array([row.residual_m for row in rows if row.kind == kind and row.residual_m is not None])
     if not len(off):
-        return entries.PointErrors3d(num=0, rmse_m=None, rmse_3d_m=None)
+        return PointErrors3d(num=0, rmse_m=None, rmse_3d_m=None)
     squares = np.mean(off**2, axis=0)
-    return entries.PointErrors3d(num=len(off), rmse_m=np.sqrt(squares).tolist(), rmse_3d_m=math.sqrt(squares.sum()))
+    return PointErrors3d(num=len(off), rmse_m=np.sqrt(squares).tolist(), rmse_3d_m=math.sqrt(squares.sum()))
 
 
 def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:

@@ -19,13 +19,14 @@ from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, in_bins
+from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale, bins_on
 from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.measurements.ranges.scale.solution import refuse_ambiguity, solution_from
+from rangesfm.measurements.ranges.words import RANGES
 from rangesfm.options import LENGTH_M
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.solver.bending import MapBending

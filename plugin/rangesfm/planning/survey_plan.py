@@ -12,8 +12,8 @@ import numpy as np
 from rangesfm.diagnostics.place import place_in_words
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.vision_information import VisionInformation
+from rangesfm.measurements.kinds_in_words import component_words
 from rangesfm.measurements.mistake_words import mistake_in_words
-from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey

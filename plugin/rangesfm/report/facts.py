@@ -32,9 +32,7 @@ def _what(content: Content) -> str:
     said = [f"{count(summary.map.num_photos)} photos{way} show {num_points} points."]
     if summary.has_ranges:
         said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {_anchors(content)} give it metres.")
-    if summary.imu is not None:
-        num = count(summary.imu.num_used)
-        said.append(f"{num} samples of an inertial sensor give it metres, and say what is up.")
+    said += filter(None, (entry.fact for entry in summary.of_kinds.values()))
     if summary.distances:
         said.append(f"Measured lengths that fix its scale or check it: {len(summary.distances)}.")
     if summary.refine is None or not summary.refine.kept:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.kinds_in_words import component_words
 from rangesfm.measurements.mistake_words import mistake_in_words
-from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan, size_in_words
 from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of

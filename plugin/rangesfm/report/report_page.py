@@ -65,7 +65,8 @@ _SECTIONS: dict[tuple[str, str], _Parts] = {
         (report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
     ("anchors", "Anchors and measured lengths"): ((), (report_tables.anchors, report_tables.distances)),
-    ("points", "Known points and positions"): ((), (report_tables.control_points, report_tables.positions_used)),
+    ("points", "Known points and positions"): ((), (report_tables.control_points,)),
+    ("others", "Other measurements"): ((), ()),
 }
 _APPENDIX: dict[tuple[str, str], _Parts] = {
     ("mistakes", "Mistakes that were tested for and not found"): (
@@ -97,7 +98,7 @@ def sections_of(content: Content) -> list[Section]:
     sections = []
     for (id_, title), (drawn, listed) in (_SECTIONS | _APPENDIX).items():
         figures = [figure for make in drawn for figure in make(content)]
-        tables = [make(content) for make in listed]
+        tables = [*(make(content) for make in listed), *report_tables.of_kinds(content, id_)]
         is_open, is_appendix = (id_, title) == _FOUND, (id_, title) in _APPENDIX
         sections.append(Section(id_, title, figures, tables, is_open, is_appendix))
     return sections

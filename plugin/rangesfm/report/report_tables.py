@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,8 +13,8 @@ import numpy as np
 from markupsafe import Markup
 
 from rangesfm.arrays import median, rms
+from rangesfm.measurements.kinds_in_words import component_words
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
-from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.facts import frame_in_words
@@ -59,18 +59,6 @@ _STATUSES = {
 _ALIGNED = {
     "site": "in the site's frame, without any alignment",
     "first_camera": "after alignment by the pose of the first keyframe, because the map has no place in the site",
-}
-_POSITIONS = {
-    "num": "in the file",
-    "num_used": "used",
-    "num_rejected": "on the path, and rejected as they do not fit",
-    "rms_m": "RMS residual, m",
-    "rms_by_axis_m": "by coordinate, m",
-    "stddev_m": "standard deviation of a coordinate, as learnt, m",
-    "inflation": "factor on the standard deviation of a mean, as their errors last",
-    "time_offset_s": "time offset, s",
-    "time_offset_stddev_s": "standard deviation of that offset by the search, s",
-    "antenna_in_cam_m": "lever arm, m",
 }
 
 
@@ -276,9 +264,11 @@ def distances(content: Content) -> ReportTable:
     return ReportTable("Control and check distances", header, rows)
 
 
-def positions_used(content: Content) -> ReportTable:
-    """Return the table of the positions of an antenna: how many are used, and how they fit."""
-    return _listed("Positions of the antenna", content, "positions", _POSITIONS)
+def of_kinds(content: Content, section: str) -> Iterator[ReportTable]:
+    """Yield a table for each kind of measurement whose entry says that it has one in a section."""
+    for key, entry in content.summary.of_kinds.items():
+        if entry.section == section:
+            yield _listed(entry.caption, content, key, entry.meanings)
 
 
 def control_points(content: Content) -> ReportTable:

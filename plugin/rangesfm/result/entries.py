@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
@@ -285,62 +284,6 @@ class RefineEntry(Record):
     short_range_error_m: NumberOrNull
 
 
-class PositionsEntry(Record):
-    """Positions of an antenna on the camera, and their residuals in the final map.
-
-    Attributes:
-        num: in the file. num_used: that fit. num_rejected: on the path, that do not fit; the others are not on it.
-        rms_m: length of the residuals of those used. rms_by_axis_m: of each coordinate.
-        stddev_m: learnt standard deviation of a coordinate.
-        inflation: of the standard deviation of a mean, by errors that last.
-        time_offset_s: image time = time of the position + this; null where the file names photos.
-        antenna_in_cam_m: lever arm, as given or estimated.
-    """
-
-    num: Count
-    num_used: Count
-    num_rejected: Count
-    rms_m: NumberOrNull
-    rms_by_axis_m: VectorOrNull
-    stddev_m: NumberOrNull
-    inflation: NumberOrNull
-    time_offset_s: NumberOrNull
-    time_offset_stddev_s: NumberOrNull
-    antenna_in_cam_m: Vector
-
-
-class ImuTimeOffsetEntry(Record):
-    """The time offset of an inertial sensor: image time = time of its log + ``value_s``."""
-
-    value_s: Number
-    stddev_s: Number
-
-
-class ImuEntry(Record):
-    """The inertial sensor, as far as the final map shows it.
-
-    Attributes:
-        num: samples in the log. num_used: between the photos.
-        rotation_imu_to_cam_xyzw: takes the sensor's axes to the camera's.
-        gravity_in_world: m/s^2, in the world of the metric models. up_stddev_deg: standard deviation of its direction.
-        accel_scale_factors: by how much the axes of the accelerometer read too much, 1: not at all.
-        accel_bias_m_s2, gyro_bias_rad_s: mean biases.
-        accel_noise, gyro_noise: densities of the white noise, m/s^2 and rad/s per root of Hz.
-    """
-
-    num: Count
-    num_used: Count
-    time_offset: ImuTimeOffsetEntry
-    rotation_imu_to_cam_xyzw: tuple[Number, Number, Number, Number]
-    gravity_in_world: Vector
-    up_stddev_deg: NumberOrNull
-    accel_scale_factors: Vector
-    accel_bias_m_s2: Vector
-    gyro_bias_rad_s: Vector
-    accel_noise: NumberOrNull
-    gyro_noise: NumberOrNull
-
-
 class DistanceRow(Record):
     """One measured length in metres: measured, in the map, and the difference map minus measurement."""
 
@@ -351,51 +294,6 @@ class DistanceRow(Record):
     stddev_m: Number
     estimated_m: NumberOrNull
     residual_m: NumberOrNull
-
-
-class PointRow(Record):
-    """One control or check point, in the frame of the metric models.
-
-    Attributes:
-        kind: "control", "check" or "left out".
-        estimated_m: by the marks in the final map; null where fewer than two of its photos have them.
-        residual_m: in the map minus known. distance_m: its length.
-    """
-
-    marker: Text
-    kind: Text
-    known_m: Vector
-    stddev_m: Number
-    estimated_m: VectorOrNull
-    residual_m: VectorOrNull
-    distance_m: NumberOrNull
-
-
-class PointErrors3d(Record):
-    """Root mean square of the residuals of some points.
-
-    Attributes:
-        num: of points that are in the map. rmse_m: of each coordinate. rmse_3d_m: of the distances.
-    """
-
-    num: int
-    rmse_m: VectorOrNull
-    rmse_3d_m: NumberOrNull
-
-
-class PointsEntry(Record):
-    """Control and check points, compared with the final map."""
-
-    control: PointErrors3d
-    check: PointErrors3d
-    points: tuple[PointRow, ...]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines that the user sees at the end of a run."""
-        for kind, errors in (("control", self.control), ("check", self.check)):
-            if errors.rmse_m is not None:
-                axes = ", ".join(f"{value:.3f}" for value in errors.rmse_m)
-                yield f"{kind} points: {errors.num}, RMSE {errors.rmse_3d_m:.3f} m (x, y, z: {axes} m)"
 
 
 class MistakeEntry(Record):

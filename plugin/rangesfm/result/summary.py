@@ -13,11 +13,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import numpy as np
-
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.place import Place
 from rangesfm.errors import number_text
+from rangesfm.measurements.imu.entry import ImuEntry
+from rangesfm.measurements.kind_entry import KindEntry
+from rangesfm.measurements.positions.entry import PointsEntry, PositionsEntry
 from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.result import entries
 from rangesfm.result.comparison_row import ComparisonRow, format_table
@@ -71,9 +72,9 @@ class ResultSummary(Record):
     tests: tuple[entries.MistakeEntry, ...] = ()
     reliability: entries.ReliabilityEntry | None = None
     distances: tuple[entries.DistanceRow, ...]
-    positions: entries.PositionsEntry | None = None
-    points: entries.PointsEntry | None = None
-    imu: entries.ImuEntry | None = None
+    positions: PositionsEntry | None = None
+    points: PointsEntry | None = None
+    imu: ImuEntry | None = None
     comparison: tuple[ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
@@ -94,13 +95,18 @@ class ResultSummary(Record):
         return self.ranges.num > 0
 
     @property
+    def of_kinds(self) -> dict[str, KindEntry]:
+        """Return the entries of the kinds of measurement that have one of their own, by key."""
+        of_keys = {key: getattr(self, key) for key in type(self).model_fields}
+        return {key: entry for key, entry in of_keys.items() if isinstance(entry, KindEntry)}
+
+    @property
     def up(self) -> tuple[Array, float] | None:
         """The upward unit vector (3,) of the map and its standard deviation (radians); None if unknown."""
         if self.frame == "site":
             return UP_IN_SITE, 0.0
-        if self.imu is not None and self.imu.up_stddev_deg is not None:
-            down = np.array(self.imu.gravity_in_world)
-            return -down / np.linalg.norm(down), np.deg2rad(self.imu.up_stddev_deg)
+        if measured := [up for entry in self.of_kinds.values() if (up := entry.up) is not None]:
+            return measured[0]
         gravity = gravity_of(self.settings.to_json().get("scale", {}).get("up_in_first_camera"))
         return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
@@ -136,18 +142,8 @@ class ResultSummary(Record):
             held = [abs(residual_m) for residual_m in control if residual_m is not None]
             worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
             yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
-        if self.positions is not None:
-            num, rms = f"{self.positions.num_used} of {self.positions.num}", _text(self.positions.rms_m, ".3f")
-            shift_s = self.positions.time_offset_s
-            offset_of_positions = "" if shift_s is None else f", time offset {_text(shift_s, '+.3f')} s"
-            yield f"positions: {num} used, rms {rms} m{offset_of_positions}"
-        if self.points is not None:
-            yield from self.points.lines()
-        if self.imu is not None:
-            tilt = (
-                "" if self.imu.up_stddev_deg is None else f", level within {NORMAL_95 * self.imu.up_stddev_deg:.2f} deg"
-            )
-            yield f"inertial sensor: {self.imu.num_used} of {self.imu.num} samples used{tilt} (95 %)"
+        for entry in self.of_kinds.values():
+            yield from entry.lines()
         if offset.estimated:
             within_s = None if offset.stddev_s is None else NORMAL_95 * offset.stddev_s
             value, within = _text(offset.value_s, "+.3f"), _text(within_s, ".3f")

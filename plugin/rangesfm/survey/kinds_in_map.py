@@ -13,27 +13,29 @@ from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
-from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
+from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
+from rangesfm.measurements.imu.words import IMU_WORDS
 from rangesfm.measurements.joint_map import KindOnMap, Located, find_kind, upward_by
 from rangesfm.measurements.kind import Block, Measurements
+from rangesfm.measurements.kind_words import KindWords
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
-from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
 from rangesfm.measurements.lengths.locate_lengths import (
     NO_DISTANCES,
     locate_distances,
     surveyed_distances,
 )
+from rangesfm.measurements.lengths.words import LENGTH_WORDS
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
-from rangesfm.measurements.positions.position_fit import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.positions.words import POSITION_WORDS
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesOnPath
+from rangesfm.measurements.ranges.words import RANGE_WORDS
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -94,7 +96,7 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     except GeometryError as error:
         if at.before:
             raise
-        return replace(begun, notes=(_not_used(POSITIONS, error),))
+        return replace(begun, notes=(POSITION_WORDS.not_used(error),))
 
 
 def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array]) -> SurveyedPositions:
@@ -122,23 +124,25 @@ def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
     return scale_by_sensor(InertialProblem.of_sensor(inputs.imu, alignment, at.path, at.bending, size))
 
 
-KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], Located | None]] = {
-    RANGES: _ranges,
-    POSITIONS: _positions,
-    LENGTHS: _lengths,
-    IMU: _inertial,
-}
-"""How each kind is located in a map, by its name. The first that is used decides what is doubtful."""
-_WORDS = {
-    RANGES: "ranges",
-    POSITIONS: "known positions",
-    LENGTHS: "known lengths",
-    IMU: "readings of the inertial sensor",
-}
+@dataclass(frozen=True)
+class Kind:
+    """A row of the table of kinds.
+
+    Attributes:
+        words: how people are told of it. locate: returns it in a map; None where it is not in it.
+    """
+
+    words: KindWords
+    locate: Callable[[RangingInputs, MapOfPhotos], Located | None]
 
 
-def _not_used(kind: str, error: GeometryError) -> str:
-    return f"the {_WORDS[kind]} are not used: {error}"
+KINDS = (
+    Kind(RANGE_WORDS, _ranges),
+    Kind(POSITION_WORDS, _positions),
+    Kind(LENGTH_WORDS, _lengths),
+    Kind(IMU_WORDS, _inertial),
+)
+"""All kinds of measurement. The first that is used decides what is doubtful."""
 
 
 def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located, ...], tuple[str, ...]]:
@@ -148,15 +152,15 @@ def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located,
         InputError: a measurement cannot be in the map. GeometryError: what was used before no longer can be.
     """
     found, remarks = list[Located](), list[str]()
-    for kind, locate in KINDS.items():
-        if at.before and all(kind != each.kind for each in at.before):
+    for kind in KINDS:
+        if at.before and all(kind.words.kind != each.kind for each in at.before):
             continue
         try:
-            located = locate(inputs, at)
+            located = kind.locate(inputs, at)
         except GeometryError as error:
             if at.before:
                 raise
-            remarks.append(_not_used(kind, error))
+            remarks.append(kind.words.not_used(error))
             continue
         found += [] if located is None else [located]
     return tuple(found), tuple(remarks)

@@ -35,10 +35,10 @@ from rangesfm.measurements.imu.preintegration import (
     Preintegrated,
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
+from rangesfm.measurements.imu.words import IMU, IMU_WORDS
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.options import RefineOptions
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.mistakes import MistakeTests
@@ -49,7 +49,6 @@ from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SI
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import first_camera_from
 
-IMU = "imu"
 # Observations from which the sizes of errors are learnt before there are other kinds.
 _NUM_OBSERVATIONS = MAX_NUM_OBSERVATIONS // 3
 # Sites lean less than this, radians: floors, tripods and motion capture are levelled to a degree.
@@ -72,15 +71,8 @@ class InertialScale(KindOnMap):
     sizes: Sizes
     intervals: Preintegrated
 
-    kind = IMU
-
-    @property
-    def words(self) -> str:
-        return "inertial sensor"
-
-    @property
-    def remedy(self) -> str:
-        return "measure a length, and look at what the notes say of the sensor's alignment"
+    kind, words = IMU, IMU_WORDS.words
+    remedy = "measure a length, and look at what the notes say of the sensor's alignment"
 
     @property
     def start(self) -> Similarity:
@@ -134,9 +126,9 @@ class InertialScale(KindOnMap):
         for name in self.sizes:
             factor = problem.sizes[name] / usual[name].median
             if np.log(factor) > SIGNIFICANT_STDDEVS * usual[name].spread:
-                [words] = component_words([name]).values()
                 yield (
-                    f"the {words} would be {factor:.0f} times the usual: do the accelerations belong to this motion? "
+                    f"the {IMU_WORDS.errors[name]} would be {factor:.0f} times the usual: "
+                    "do the accelerations belong to this motion? "
                     "the sensor has to be fixed to the camera, with the axes of the gyroscope for the accelerometer"
                 )
 

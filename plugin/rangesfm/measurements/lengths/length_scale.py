@@ -18,9 +18,10 @@ from rangesfm.measurements.joint_map import (
     most_contradicting,
 )
 from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.lengths.lengths_on_map import LENGTHS, lengths_on_map
+from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance
+from rangesfm.measurements.lengths.words import LENGTH_WORDS, LENGTHS
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests
@@ -60,7 +61,7 @@ class LengthScale(KindOnMap):
     taped: tuple[TapedDistance, ...] = ()
 
     kind = LENGTHS
-    words, remedy = "measured lengths", "measure a length again"
+    words, remedy = LENGTH_WORDS.words, "measure a length again"
 
     def observed(
         self, placed: Similarity, *, in_site: bool = False, max_num: int = MAX_NUM_OBSERVATIONS

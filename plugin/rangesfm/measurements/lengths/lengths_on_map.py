@@ -7,12 +7,12 @@ from scipy.sparse import csr_array
 
 from rangesfm.arrays import Mask
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.lengths.words import LENGTHS
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations
 from rangesfm.util.geometry.trajectory import Trajectory
 
-LENGTHS = "lengths"
 BENDING = 0.008
 """Relative variation of the scale within a map (standard deviation), for lengths at unknown places.
 

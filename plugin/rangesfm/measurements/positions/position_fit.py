@@ -19,7 +19,8 @@ from scipy.spatial.distance import cdist
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
+from rangesfm.measurements.positions.words import FRAME
+from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.noise import Component, independent_unknowns
 from rangesfm.solver.posterior import Observations
@@ -28,7 +29,6 @@ from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M
 from rangesfm.util.geometry.similarity import Similarity, align_points, path_shape, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
-POSITIONS = "positions"
 # Names of errors of an antenna's positions that last for some time start with this, as do all of its positions.
 _LASTING = "positions_"
 _WARP = f"{_LASTING}warp"

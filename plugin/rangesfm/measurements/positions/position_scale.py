@@ -20,7 +20,6 @@ from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.positions.position_fit import (
-    POSITIONS,
     GroupedPositions,
     at_point,
     components_of,
@@ -33,7 +32,7 @@ from rangesfm.measurements.positions.position_fit import (
     stddevs_as_shown,
 )
 from rangesfm.measurements.positions.surveyed_positions import NO_POSITIONS, SurveyedPositions
-from rangesfm.measurements.ranges.errors.components import FRAME
+from rangesfm.measurements.positions.words import FRAME, POSITION_WORDS, POSITIONS
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.options import LEVER_ARM_M, RefineOptions
 from rangesfm.solver.bending import MapBending
@@ -107,7 +106,7 @@ class PositionScale(KindOnMap):
 
     kind = POSITIONS
     shows_bending = True
-    words, remedy = "known positions", "look at the units of both"
+    words, remedy = POSITION_WORDS.words, "look at the units of both"
 
     @classmethod
     def begun(

@@ -7,8 +7,7 @@ learns its own standard deviations, with the population as prior.
 from __future__ import annotations
 
 import functools
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -18,7 +17,6 @@ from scipy.spatial.distance import cdist
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.ranges.errors.noise import SHORT_RANGE_LENGTH_M
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
-from rangesfm.solver.bending import BENDS
 
 LASTING_S = 3.0
 """Correlation time of errors that last for seconds."""
@@ -215,7 +213,7 @@ COMPONENTS = components(population())
 OtherError = Literal["learnt_curve", "given", "clocks", "places", "wandering", "bursts"]
 """Names of errors that are no components to be learnt; the checker of types finds one without a description."""
 
-_OTHERS: Mapping[OtherError, str] = {
+OTHER_ERRORS: Mapping[OtherError, str] = {
     "learnt_curve": "what the calibration of the radio leaves open",
     "given": "given values: anchors' positions, lengths and others",
     "clocks": "time offset between the clocks",
@@ -238,44 +236,3 @@ WANDERING: Final = "wandering"
 
 BURSTS: Final = "bursts"
 """Error of ranges that tests leave out, as they err for seconds and are right again."""
-
-
-FRAME = "frame"
-"""Error of the frame of known positions, in its place and its scale; not a component of the ranges' errors."""
-
-
-def component_words(names: Iterable[str]) -> dict[str, str]:
-    """Return descriptions of components for people, by name."""
-    words = {component.name: component.words for component in COMPONENTS} | BENDS | {**_OTHERS}
-    words |= {
-        "points": "coordinates of the control points",
-        "positions": "noise of the known positions",
-        "positions_warp": "errors of the positions that belong to a place",
-        FRAME: "size of the site as the positions have it",
-        "tape": "errors of the measured lengths",
-        "marks": "marking of points in the photos",
-        "gyro_noise": "noise of the gyroscope",
-        "gyro_bias_walk": "wandering of the gyroscope's zero",
-        "gyro_bias": "zero of the gyroscope",
-        "gyro_scale": "scale factors of the gyroscope",
-        "accel_noise": "noise of the accelerometer",
-        "accel_bias_walk": "wandering of the accelerometer's zero",
-        "accel_bias": "zero of the accelerometer",
-        "accel_scale": "scale factors of the accelerometer",
-        "accel_cross": "angles between the axes of the accelerometer",
-        "photo_times": "times of the photos against the inertial sensor",
-        "pose_turns": "noise of the photos' turns",
-        "pose_places": "noise of the photos' places",
-        "log_gaps": "gaps in the log of the inertial sensor",
-        "imu_clock": "time offset of the inertial sensor",
-        "imu_turn": "rotation between camera and inertial sensor",
-        "imu_place": "place of the inertial sensor on the camera",
-        "gravity": "length of gravity",
-    }
-    lasting = re.compile(r"positions_(.+)s")
-    return {
-        name: f"errors of the known positions that last for {found[1]} s"
-        if (found := lasting.fullmatch(name))
-        else words[name]
-        for name in names
-    }

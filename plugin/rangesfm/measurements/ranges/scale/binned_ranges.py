@@ -17,11 +17,10 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     state_after,
 )
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
+from rangesfm.measurements.ranges.words import RANGES
 from rangesfm.solver.bending import BENDS
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Noise
 from rangesfm.solver.posterior import Observations, Posterior
-
-RANGES = "ranges"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
+from rangesfm.measurements.ranges.scale.binned_ranges import BinnedRanges, binned_ranges, moved, shared_errors_m
 from rangesfm.measurements.ranges.scale.doubts import (
     doubts_of_ranges,
     levelled_places,
@@ -35,6 +35,7 @@ from rangesfm.measurements.ranges.scale.range_estimate import (
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.solution import with_unknown_anchors
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.measurements.ranges.words import RANGE_WORDS, RANGES
 from rangesfm.solver.bending import NO_STEPS, FrameSteps
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Posterior, ScaleByKind, ScaleUncertainty
@@ -60,7 +61,7 @@ class RangeScale(KindOnMap):
     told: RangeEstimate
     notes: tuple[str, ...] = ()
 
-    kind = words = RANGES
+    kind, words = RANGES, RANGE_WORDS.words
     method = "robust"
     clock = CLOCKS
     is_solved = shows_bending = True

@@ -14,13 +14,13 @@ from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.range_observations import RangeObservations
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem, turns_and_velocities
 from rangesfm.measurements.ranges.scale.solution import solution_from, solve_scale
+from rangesfm.measurements.ranges.words import RANGES
 from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import Gravity
