@@ -68,9 +68,8 @@ def test_likely_steps_are_to_the_photos_minimum_and_then_as_far_as_the_covarianc
     by_pose, pull = along_x(bending.path), np.random.default_rng(4).normal(size=NUM)
 
     def moved(pulls: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
-        turns, shifts_m = bending.likely_steps(pulls, 3.0, frame_is_free=frame_is_free).at(bending.frame_ids)
-        in_model = shifts_m @ bending.world_from_model / bending.metres_per_unit
-        return np.asarray(by_pose @ np.hstack([turns, in_model]).ravel())
+        turns, shifts_m = bending.likely_steps(pulls, 3.0, frame_is_free=frame_is_free).at(bending.path.frame_ids)
+        return np.asarray(by_pose @ np.hstack([turns, shifts_m]).ravel())
 
     expected = bending.of_functions(by_pose, frame_is_free=frame_is_free)
     unmoved = moved(np.zeros(6 * NUM))

@@ -54,15 +54,15 @@ class Steps(KindOnMap):
 
     @cached_property
     def alone(self) -> JointMap:
-        return fit_kinds((self,), self.at.path, self.start, self.at.bending)
+        return fit_kinds((self,), self.start, self.at.bending)
 
     def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
-        num, path, nothing = len(self.distance_m), self.at.path, np.zeros(0, dtype=np.int64)
+        num, nothing = len(self.distance_m), np.zeros(0, dtype=np.int64)
         predicted_m = placed.scale * np.linalg.norm(self.away, axis=1)
-        along = self.away / np.linalg.norm(self.away, axis=1)[:, None] @ path.world_from_cam[0]
+        along = self.away / np.linalg.norm(self.away, axis=1)[:, None]
         by_pose, rows = np.zeros((num, num + 1, 6)), np.arange(num)
-        by_pose[rows, rows + 1, 3:] = placed.scale * self.at.metres_per_unit * along
-        by_pose[rows, rows, 3:] = -placed.scale * self.at.metres_per_unit * along
+        by_pose[rows, rows + 1, 3:] = placed.scale * along
+        by_pose[rows, rows, 3:] = -placed.scale * along
         noise_m2 = STEPS_STDDEV_M**2 * np.eye(num)
         return Observations(
             kind=STEPS,

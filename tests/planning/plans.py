@@ -13,7 +13,7 @@ from rangesfm.estimation.free_fit import GraphBending
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.planning.expected import Expected
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]
@@ -36,7 +36,7 @@ def free_bend_m(expected: Expected) -> float:
     assert expected.vision is not None
     centers = np.zeros((len(path), 3, len(path), 6))
     centers[np.arange(len(path)), :, np.arange(len(path)), 3:] = np.eye(3)
-    bending = GraphBending(expected.vision, in_first_camera(path))
+    bending = GraphBending(expected.vision, path)
     covariance = bending.of_functions(centers.reshape(3 * len(path), -1), frame_is_free=True).formal_m2
     return float(np.sqrt(np.trace(covariance) / len(path)))
 

@@ -21,7 +21,6 @@ from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import IDENTITY
-from rangesfm.util.geometry.trajectory import in_first_camera
 
 STDDEV_M = 0.02
 WALK = loop(30.0, 60)
@@ -43,13 +42,11 @@ def test_what_control_points_give_is_what_a_run_states_of_them() -> None:
     plan = by_points(12)
     expected = expect(plan)
     known = known_positions(plan)
-    bending = WalkBending(in_first_camera(plan.trajectory))
+    bending = WalkBending(plan.trajectory)
     stated = []
     for seed in range(8):
         off_m = STDDEV_M * np.random.default_rng(seed).standard_normal(known.position_m.shape)
-        found = scale_by_positions(
-            PositionScale.begun(replace(known, position_m=known.position_m + off_m), plan.trajectory, bending)
-        )
+        found = scale_by_positions(PositionScale.begun(replace(known, position_m=known.position_m + off_m), bending))
         stated.append(found.alone.posterior.uncertainty.empirical)
     assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.35)
 

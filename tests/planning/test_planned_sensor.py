@@ -21,7 +21,6 @@ from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.solver.bending import WalkBending
-from rangesfm.util.geometry.trajectory import in_first_camera
 
 LEVEL = """[path]
 waypoints = [[2, 2, 1.6], [10, 2, 1.6], [10, 6, 1.6], [2, 6, 1.6], [2, 2, 1.6]]
@@ -35,11 +34,11 @@ def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion
     path, log = photos(motion, noise_rad=5e-4, bend=0.002, seed=seed), imu_log(motion, grade=PHONE, seed=seed)
     sensor = InertialSensor(log).aligned_with(path)
     assert sensor.alignment is not None
-    problem = InertialProblem.of_sensor(sensor, sensor.alignment, path, WalkBending(in_first_camera(path)))
+    problem = InertialProblem.of_sensor(sensor, sensor.alignment, WalkBending(path))
     run = scale_by_sensor(problem)
     turns = motion.world_from_imu(path.times_s).as_matrix() @ CAM_FROM_IMU.T
     true = replace(path, centers=motion.places_m(path.times_s), world_from_cam=turns)
-    on_map = PlannedSensor().on_map(true, PlannedBending(WalkBending(in_first_camera(true)), {}))
+    on_map = PlannedSensor().on_map(PlannedBending(WalkBending(true), {}))
     alike = replace(replace(on_map, sizes=run.sizes).alone.problem, sizes=run.alone.problem.sizes)
     assert alike.posterior().uncertainty.empirical == pytest.approx(run.alone.posterior.uncertainty.empirical, rel=0.15)
 

@@ -27,7 +27,7 @@ from rangesfm.sfm.photo_files import usable_photos
 from rangesfm.sfm.reconstruct import reconstruct
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.solver.bending import WalkBending
-from rangesfm.util.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 NUM_CAMERAS, NUM_FRAMES = 3, 8
 PREFIXES = [f"camera{k:06d}_" for k in range(1, NUM_CAMERAS + 1)]
@@ -164,7 +164,7 @@ def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_anoth
     assert len(taped) == num_measured
     path = trajectory_from_reconstruction(model)
     located = locate_distances(Tape(taped), model, [])
-    found = known_scale(lengths_between_points(located, path, WalkBending(in_first_camera(path)))).alone
+    found = known_scale(lengths_between_points(located, WalkBending(path))).alone
     assert found.scale.value == pytest.approx(1.0, rel=1e-3)
     expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)
     assert found.posterior.uncertainty.empirical == pytest.approx(expected, rel=1e-3)

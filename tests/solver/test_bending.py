@@ -60,7 +60,9 @@ def from_anchors_m(path: Trajectory) -> Array:
 def slopes(path: Trajectory) -> Array:
     """(n, 6 k) derivatives of the ranges; the lever arm turns with the pose before the range."""
     _, rotations, arms = placed(path)
-    found = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, rotations, arms, ON_PATH)
+    into = METRIC_FROM_MODEL.rotation
+    gradient = RangeGradient.of(from_anchors_m(path))
+    found = by_poses(gradient, METRIC_FROM_MODEL, into @ rotations, arms @ into.T, ON_PATH)
     return np.asarray(found.toarray())
 
 
@@ -82,7 +84,8 @@ def test_ranges_at_a_pose_grow_as_it_turns_in_its_own_frame() -> None:
         return np.asarray(METRIC_FROM_MODEL.apply(np.ones((1, 3))) + arm_m)
 
     gradient = RangeGradient.of(tag_m(turn) - ANCHORS_M[:1])
-    found = by_poses(gradient, METRIC_FROM_MODEL, turn[None], (turn @ ARM_IN_CAM_M)[None], only).toarray()[0, :3]
+    into = METRIC_FROM_MODEL.rotation @ turn
+    found = by_poses(gradient, METRIC_FROM_MODEL, into[None], (into @ ARM_IN_CAM_M)[None], only).toarray()[0, :3]
     for axis in range(3):
         turned = turn @ Rotation.from_rotvec(STEP * np.eye(3)[axis]).as_matrix()
         grown = np.linalg.norm(tag_m(turned) - ANCHORS_M[:1]) - gradient.distance_m[0]

@@ -56,7 +56,7 @@ from rangesfm.planning.expected import PlannedBending
 from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 MOTIONS: dict[str, Callable[[int], Motion]] = {
     "hand": by_hand,
@@ -89,8 +89,8 @@ def located(sensor: InertialSensor, path: Trajectory) -> tuple[InertialScale, st
     """Return the sensor on the map, as a run finds it, and the warnings."""
     aligned = sensor.aligned_with(path)
     assert aligned.alignment is not None
-    bending = WalkBending(in_first_camera(path))
-    found = scale_by_sensor(InertialProblem.of_sensor(aligned, aligned.alignment, path, bending))
+    bending = WalkBending(path)
+    found = scale_by_sensor(InertialProblem.of_sensor(aligned, aligned.alignment, bending))
     return found, "; ".join(aligned.alignment.mistakes)
 
 
@@ -111,7 +111,7 @@ def surveyed(motion: Motion, of_grade: str, seed: int) -> Found:
     turns = motion.world_from_imu(path.times_s).as_matrix() @ CAM_FROM_IMU.T
     path = replace(path, centers=motion.places_m(path.times_s), world_from_cam=turns)
     sensor = PlannedSensor(grade=of_grade)  # type: ignore[arg-type]
-    planned = sensor.on_map(path, PlannedBending(WalkBending(in_first_camera(path)), sensor.sizes)).alone
+    planned = sensor.on_map(PlannedBending(WalkBending(path), sensor.sizes)).alone
     widths = known.posterior.uncertainty.half_width_95, planned.posterior.uncertainty.half_width_95
     return Found(off, tilt, widths[0], "; ".join([told, *doubts]), widths[1])
 

@@ -59,7 +59,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
-from rangesfm.util.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
@@ -209,10 +209,8 @@ class Known:
             NormalEquations.of(photos_problem, truth.reconstruction, photos_problem.num_residuals()), pixel_stddev
         )
         is_firm = np.ones(len(path), dtype=bool)
-        bending = PhotoBending(
-            photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, is_firm, True
-        )
-        found = scale_by_positions(PositionScale.begun(known, path, bending))
+        bending = PhotoBending(photos, path, is_firm, True)
+        found = scale_by_positions(PositionScale.begun(known, bending))
         problem = found.alone.problem
         parts = {part.name: part.alike for part in problem.components}
         covariance = problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))

@@ -48,7 +48,7 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_ranges import true_state
 from rangesfm.solver.bending import BENDS, WalkBending
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from
 
 Array = npt.NDArray[np.float64]
 
@@ -218,8 +218,8 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
         else:
-            bending = WalkBending(in_first_camera(trajectory))
-            given = (observations, trajectory, bending, anchors, planned.anchor_frame, planned.range_model, distances)
+            bending = WalkBending(trajectory)
+            given = (observations, bending, anchors, planned.anchor_frame, planned.range_model, distances)
             posed = scale_problem(RangesOnPath(*given))
             solved = solution_from(posed, truth(planned, posed))
             metric_from_map = solved.state.metric_from_model @ first_camera_from(trajectory)

@@ -93,7 +93,7 @@ def main() -> int:
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
         timed = find_antenna_offset(track, path)
         known = locate_antenna(timed, path)
-        found = scale_by_positions(PositionScale.begun(known, path, bending, SurveyedPositions(antenna=timed)))
+        found = scale_by_positions(PositionScale.begun(known, bending, SurveyedPositions(antenna=timed)))
         told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)
         if seed < asked.num_refined:
             told("refined", *refined(whole, track))

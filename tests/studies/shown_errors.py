@@ -25,7 +25,6 @@ from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
 from rangesfm.measurements.ranges.scale.solution import solve_scale
 from rangesfm.solver.bending import WalkBending
-from rangesfm.util.geometry.trajectory import in_first_camera
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
@@ -60,8 +59,8 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
     path = path_of(reference)
     case = next(case for case in cases(log, anchors, path) if case.name == "known")
     observations = placed(log, case, path, described, by_photo=False)
-    bending = WalkBending(in_first_camera(path))
-    posed = scale_problem(RangesOnPath(observations, path, bending, case.anchors, case.frame))
+    bending = WalkBending(path)
+    posed = scale_problem(RangesOnPath(observations, bending, case.anchors, case.frame))
     solved = solve_scale(posed)
     state = solved.state
     true = replace(

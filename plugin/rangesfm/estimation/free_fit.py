@@ -135,7 +135,7 @@ class GraphBending:
     """Bending of a map as the photos' information on relative poses allows it.
 
     Attributes:
-        vision: of a map with the same poses, in any world. path: of the map, in its first camera's frame.
+        vision: of a map with the same poses, in any world. path: of the map, in its own.
     """
 
     vision: VisionInformation
@@ -145,7 +145,8 @@ class GraphBending:
         is_firm = np.ones(len(self.path), dtype=bool)
         functions = without_similarity(by_pose, self.path, is_firm, frame_is_free=frame_is_free)
         parts = functions.reshape(len(by_pose), -1, 6)
-        parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
+        turn = self.path.world_from_cam[0] @ self.vision.origin.world_from_rig[0].T  # from one world to the other
+        parts[:, :, 3:] = parts[:, :, 3:] @ turn
         covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))
         return Bending(bending_parts("bending", covariance, 1.0, 0.0), covariance, np.zeros(len(by_pose)))
 

@@ -36,7 +36,7 @@ def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
     steps = bending.likely_steps(
         known.pulls @ at_rest.by_pose, _factor(problem), frame_is_free=known.columns.frame >= 0
     )
-    firm_m = (at_rest.path.centers + steps.at(bending.frame_ids)[1])[bending.is_firm]
+    firm_m = (at_rest.path.centers + steps.at(bending.path.frame_ids)[1])[bending.is_firm]
     size = at_rest.metres_per_unit / align_points(unscaled.centers[bending.is_firm], firm_m).scale
     from_first_m = bending.from_first_m
     return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)

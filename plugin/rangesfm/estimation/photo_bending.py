@@ -28,7 +28,7 @@ from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.poses import model_poses
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 4 in a room of real photos, 8 to 12 in three scenes of others
@@ -46,18 +46,13 @@ class PhotoBending:
     """Bending of a map with points, from its bundle adjustment.
 
     Attributes:
-        photos: linearised at the map as it is. frame_ids: of the path.
-        path: in the model's world, which is the first camera's frame. world_from_model: rotation to the map's world.
-        metres_per_unit: metres of the map's world per unit of the model.
+        photos: linearised at the map as it is. path: of the map, in its world.
         is_firm: (k,) True for the poses of the path that the photos hold together; the map's size and place are theirs.
         is_at_optimum: whether the map is at the photos' own minimum.
     """
 
     photos: PhotosAlone
-    frame_ids: Indices
     path: Trajectory
-    world_from_model: Array
-    metres_per_unit: float
     is_firm: Mask
     is_at_optimum: bool
 
@@ -88,21 +83,17 @@ class PhotoBending:
 
     def similarity_by_steps(self, *, frame_is_free: bool) -> Array:
         """Return the derivatives (n, 7) by the photos' steps of the map as a whole, about the path's first pose."""
-        of_path = self._by_steps(similarity_of(self.path, self.is_firm, frame_is_free=frame_is_free))
-        turned = of_path[:, 1:].reshape(-1, 2, 3) @ self.world_from_model.T
-        turned[:, 1] *= self.metres_per_unit
-        return np.hstack([of_path[:, :1], turned.reshape(-1, 6)])
+        return self._by_steps(similarity_of(self.path, self.is_firm, frame_is_free=frame_is_free))
 
     def _by_steps(self, by_pose: Array) -> Array:
         parts = by_pose.reshape(len(by_pose), -1, 6)
-        by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
-        return self.photos.by_steps(self.frame_ids, parts[:, :, :3], by_center)
+        return self.photos.by_steps(self.path.frame_ids, parts[:, :, :3], parts[:, :, 3:])
 
     @property
     def from_first_m(self) -> Array:
         """(m, 3) centres of the photos' frames, from that of the first pose of the path."""
         frame_ids, poses = self.photos.poses
-        return np.asarray(poses.centers - poses.centers[np.searchsorted(frame_ids, self.frame_ids[0])])
+        return np.asarray(poses.centers - poses.centers[np.searchsorted(frame_ids, self.path.frame_ids[0])])
 
     def hold_together(self, image_names: Collection[str]) -> bool:
         """Return whether the photos determine the scale of a part of the map relative to the rest.
@@ -131,7 +122,6 @@ def bending_of_model(
     Args:
         trajectory: of the model, in its world.
     """
-    path = in_first_camera(trajectory)
     try:
         frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
         rays = model_observations(model, frame_ids)
@@ -140,17 +130,16 @@ def bending_of_model(
         if bundle.has_covariance:
             equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
             firm_ids = frames_of_largest_part(model)
-            return by_photos(equations, bundle.pixel_stddev, trajectory, 1.0, firm_ids, is_at_optimum=True)
+            return by_photos(equations, bundle.pixel_stddev, trajectory, firm_ids, is_at_optimum=True)
     except (SolverError, GeometryError, InputError):
         pass
-    return WalkBending(path)
+    return WalkBending(trajectory)
 
 
 def by_photos(
     equations: NormalEquations,
     pixel_stddev: float,
     trajectory: Trajectory,
-    metres_per_unit: float,
     firm_frame_ids: Indices,
     *,
     is_at_optimum: bool,
@@ -160,18 +149,10 @@ def by_photos(
     Args:
         pixel_stddev: standard deviation of a reprojection error's coordinate.
         trajectory: of the map, in its world.
-        metres_per_unit: metres of that world per unit of the model to which the ranges refer.
         firm_frame_ids: of the frames whose centres are the map's size and place.
 
     Raises:
         GeometryError: the photos do not determine the map up to a similarity.
     """
-    return PhotoBending(
-        PhotosAlone(equations, pixel_stddev),
-        trajectory.frame_ids,
-        in_first_camera(trajectory, metres_per_unit),
-        trajectory.world_from_cam[0],
-        metres_per_unit,
-        np.isin(trajectory.frame_ids, firm_frame_ids),
-        is_at_optimum,
-    )
+    is_firm = np.isin(trajectory.frame_ids, firm_frame_ids)
+    return PhotoBending(PhotosAlone(equations, pixel_stddev), trajectory, is_firm, is_at_optimum)

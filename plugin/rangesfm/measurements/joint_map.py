@@ -249,16 +249,15 @@ class JointMap:
 
     Attributes:
         kinds: of measurements, in the order of the table; the first that is used decides what is doubtful.
-        path: of the map. placed: from its world to the metric world, about which all is linear.
+        placed: from the map's world to the metric world, about which all is linear.
         bending: of the map. is_at_rest: whether photos and measurements made it together; otherwise it is moved as one
             piece.
         observed: the observations of the kinds that are used or compared with the map, by kind.
         problem: of all these, with learnt errors. posterior: what they say of the map.
-        metres_per_unit: of the unscaled model, in the world of the path.
+        metres_per_unit: of the unscaled model, in the world of the map.
     """
 
     kinds: tuple[KindOnMap, ...]
-    path: Trajectory
     placed: Similarity
     bending: MapBending
     is_at_rest: bool
@@ -266,6 +265,11 @@ class JointMap:
     problem: JointProblem
     posterior: Posterior
     metres_per_unit: float = 1.0
+
+    @property
+    def path(self) -> Trajectory:
+        """Of the keyframes."""
+        return self.bending.path
 
     @property
     def estimate(self) -> Similarity:
@@ -291,7 +295,7 @@ class JointMap:
 
     def rejoined(self, kinds: Sequence[KindOnMap], placed: Similarity) -> JointMap:
         """Return the same map with other measurements, placed elsewhere."""
-        return join_kinds(kinds, self.path, placed, self.bending, is_at_rest=self.is_at_rest)
+        return join_kinds(kinds, placed, self.bending, is_at_rest=self.is_at_rest)
 
     def of_log(self, before: RangeEstimate) -> RangeEstimate:
         """Return what is said of the ranges of the log; what was known before if none takes part."""
@@ -399,7 +403,7 @@ def beside_others(located: Sequence[Located], others: Sequence[KindOnMap]) -> tu
 
 
 def join_kinds(
-    kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending, *, is_at_rest: bool = False
+    kinds: Sequence[KindOnMap], placed: Similarity, bending: MapBending, *, is_at_rest: bool = False
 ) -> JointMap:
     """Join all measurements at a map, and learn their errors; arguments as of ``JointMap``."""
     found, used = observations(kinds, placed), [each for each in kinds if each.is_used]
@@ -409,16 +413,16 @@ def join_kinds(
     else:
         known = used[0].posterior(problem) if len(used) == 1 else problem.posterior()
     observed = {each.kind: each for each in found}
-    return JointMap(tuple(kinds), path, placed, bending, is_at_rest, observed, problem, known)
+    return JointMap(tuple(kinds), placed, bending, is_at_rest, observed, problem, known)
 
 
-def fit_kinds(kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending) -> JointMap:
+def fit_kinds(kinds: Sequence[KindOnMap], placed: Similarity, bending: MapBending) -> JointMap:
     """Join all measurements at the placement that they give, starting from another one.
 
     The equations are not linear in the logarithm of the scale. Kinds that were solved have theirs at their solution.
     """
     for _ in range(1 if any(each.is_solved for each in kinds) else MAX_NUM_ROUNDS):
-        found = join_kinds(kinds, path, placed, bending)
+        found = join_kinds(kinds, placed, bending)
         if abs(found.posterior.step[0]) < NEGLIGIBLE_STDDEVS**2 * found.posterior.uncertainty.empirical:
             break
         placed = found.estimate

@@ -30,7 +30,7 @@ from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS
 from rangesfm.util.geometry.poses import model_poses
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most
 
 
@@ -163,16 +163,13 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
     return replace(metric, estimate=estimate, refined=refined)
 
 
-def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
-    """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
+def _bending_at_rest(rest: MapAtRest, path: Trajectory) -> MapBending:
     if rest.equations is not None:
         try:
-            return by_photos(
-                rest.equations, rest.pixel_stddev_at_rest, path, metres_per_unit, rest.firm_ids, is_at_optimum=False
-            )
+            return by_photos(rest.equations, rest.pixel_stddev_at_rest, path, rest.firm_ids, is_at_optimum=False)
         except GeometryError:
             pass
-    return WalkBending(in_first_camera(path, metres_per_unit))
+    return WalkBending(path)
 
 
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap:
@@ -181,11 +178,11 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> 
     path = metric.trajectory.as_in(model)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
-    bending = _bending_at_rest(rest, path, scale)
-    of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, before, rest)
+    bending = _bending_at_rest(rest, path)
+    of_model = MapOfPhotos(model, bending, run.survey, metric.observations, scale, before, rest)
     located, _ = kinds_in_map(metric.inputs, of_model)
     others = tested_kinds(
         [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
     )
-    joined = join_kinds(beside_others(located, others), path, IDENTITY, bending, is_at_rest=True)
+    joined = join_kinds(beside_others(located, others), IDENTITY, bending, is_at_rest=True)
     return replace(joined, metres_per_unit=scale)

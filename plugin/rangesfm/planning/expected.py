@@ -29,7 +29,7 @@ from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import Observations, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Numbers of ranges, of observations of a kind and of keyframes in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_OBSERVATIONS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15
@@ -59,7 +59,7 @@ class PlannedBending:
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         bent, usual_m = self.bending.of_functions(by_pose, frame_is_free=frame_is_free), dict[str, float]()
         if self.sizes.keys() & {part.name for part in bent.parts}:
-            of_keyframes = _by_pose(np.eye(3), np.arange(len(self.path)), len(self.path))
+            of_keyframes = _by_pose(np.arange(len(self.path)), len(self.path))
             found = self.bending.of_functions(of_keyframes, frame_is_free=frame_is_free)
             usual_m = {part.name: part.median for part in found.parts if part.name in self.sizes}
         parts = (
@@ -197,14 +197,13 @@ def expect(
     path = planned.trajectory
     if vision is None and planned.photos is not None:
         vision = planned.photos.information(path)
-    first = in_first_camera(path)
-    bending = PlannedBending(WalkBending(first) if vision is None else GraphBending(vision, first), planned.given_sizes)
+    bending = PlannedBending(WalkBending(path) if vision is None else GraphBending(vision, path), planned.given_sizes)
     kinds, notes = kinds_at_truth(planned, bending)
     in_site = any(each.places_map for each in kinds)
     found = [*observations(kinds, IDENTITY, max_num), _keyframes(path, num_keyframes, in_site=in_site)]
     problem, observed = joined(found, bending), {each.kind: each for each in found}
     known = problem.posterior(is_refined=True)
-    on_map = JointMap(kinds, path, IDENTITY, bending, True, observed, problem, known)
+    on_map = JointMap(kinds, IDENTITY, bending, True, observed, problem, known)
     return Expected(planned, vision, on_map, notes)
 
 
@@ -212,7 +211,7 @@ def _keyframes(path: Trajectory, num: int, *, in_site: bool) -> Observations:
     some, nothing = _some(len(path), num), np.zeros(0, dtype=np.int64)
     columns = Columns(0, 1, nothing, nothing, 7) if in_site else Columns(0, -1, nothing, nothing, 1)
     motions = similarity_motions(path.centers[some] - path.centers[0]).reshape(-1, 7)
-    none, by_pose = np.zeros(len(motions)), _by_pose(path.world_from_cam[0], some, len(path))
+    none, by_pose = np.zeros(len(motions)), _by_pose(some, len(path))
     return Observations(
         columns,
         motions[:, : columns.num],
@@ -231,12 +230,8 @@ def _some(num_keyframes: int, num: int) -> Indices:
     return some
 
 
-def _by_pose(rotation: Array, keyframes: Indices, num: int) -> Array:
-    """Return the (3 k, 6 n) derivatives of the coordinates of k keyframes by the poses of a path of n.
-
-    Args:
-        rotation: (3, 3) from the axes in which ``MapBending`` has the shifts.
-    """
+def _by_pose(keyframes: Indices, num: int) -> Array:
+    """Return the (3 k, 6 n) derivatives of the coordinates of k keyframes by the poses of a path of n."""
     by_pose = np.zeros((len(keyframes), 3, num, 6))
-    by_pose[np.arange(len(keyframes)), :, keyframes, 3:] = rotation
+    by_pose[np.arange(len(keyframes)), :, keyframes, 3:] = np.eye(3)
     return by_pose.reshape(3 * len(keyframes), -1)

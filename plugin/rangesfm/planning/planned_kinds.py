@@ -37,15 +37,13 @@ def kinds_at_truth(planned: PlannedSurvey, bending: MapBending) -> tuple[tuple[K
     def positions() -> PositionScale | None:
         given = planned.antenna and planned.antenna.lasting_s
         surveyed = SurveyedPositions(lasting_s=(given,) if given else LASTING_S)
-        begun = PositionScale.begun(known, planned.trajectory, bending, surveyed, is_at_rest=True)
+        begun = PositionScale.begun(known, bending, surveyed, is_at_rest=True)
         return scale_by_positions(begun) if len(known) else None
 
     locate: dict[str, Callable[[], KindOnMap | None]] = {
         "known positions are": positions,
         "taped lengths are": lambda: _lengths(planned, bending),
-        "inertial sensor is": lambda: (
-            None if planned.sensor is None else planned.sensor.on_map(planned.trajectory, bending)
-        ),
+        "inertial sensor is": lambda: None if planned.sensor is None else planned.sensor.on_map(bending),
     }
     for words, located in locate.items():
         try:
@@ -70,4 +68,4 @@ def _lengths(planned: PlannedSurvey, bending: MapBending) -> LengthScale | None:
     lengths, stddevs = np.array(planned.taped, dtype=np.float64).reshape(-1, 2).T
     # Between its ends the scale of the map varies.
     located = LocatedDistances.between_points(lengths, np.hypot(stddevs, BENDING * lengths), lengths)
-    return lengths_between_points(located, planned.trajectory, bending)
+    return lengths_between_points(located, bending)

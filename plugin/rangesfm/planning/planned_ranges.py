@@ -49,10 +49,10 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     Raises:
         GeometryError: the run will refuse them.
     """
-    path, first_camera = planned.trajectory, first_camera_from(planned.trajectory)
+    first_camera = first_camera_from(planned.trajectory)
     into = first_camera if planned.anchor_frame == "first_camera" else IDENTITY
     told = [replace(a, position_m=into.apply(at)) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)]
-    given = RangesOnPath(_observations(planned), path, bending, told, planned.anchor_frame, planned.range_model)
+    given = RangesOnPath(_observations(planned), bending, told, planned.anchor_frame, planned.range_model)
     posed = given.posed(others)
     state, prior = true_state(planned, posed), posed.prior_errors
     tags_m, placing_m = antenna_positions(posed.ranges, state.metric_from_model), posed.placing_stddev_m(1.0)

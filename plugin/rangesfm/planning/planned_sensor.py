@@ -31,7 +31,6 @@ from rangesfm.measurements.imu.sensor_prior import (
 from rangesfm.option_model import Options
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import UP_IN_SITE
-from rangesfm.util.geometry.trajectory import Trajectory
 
 # Noise of a tactical sensor, as a share of a phone's (see ``NOISE``).
 _TACTICAL = 0.1
@@ -65,18 +64,19 @@ class PlannedSensor(Options, table="imu"):
             "pose_places": POSE_PLACES.usual,
         }
 
-    def on_map(self, path: Trajectory, bending: MapBending) -> InertialScale:
+    def on_map(self, bending: MapBending) -> InertialScale:
         """Return what the sensor says of a true map.
 
         It sits with its axes along those of the camera, which moves smoothly from photo to photo. What a run finds of
         its rotation, or is given, is known to a degree, and its clock to a part of a sample.
 
         Args:
-            path: in the site, z up. bending: of the map.
+            bending: of the map, in the site with z up.
 
         Raises:
             GeometryError: there are fewer photos than a run needs to align the sensor.
         """
+        path = bending.path
         if len(path) <= MIN_NUM_TURNS:
             raise GeometryError(f"{len(path)} photos do not tell how it sits, expected more than {MIN_NUM_TURNS}")
         times_s, mounting = path.times_s, Mounting(np.eye(3), np.zeros(3))
@@ -88,6 +88,6 @@ class PlannedSensor(Options, table="imu"):
         gravity = -GRAVITY_M_S2 * UP_IN_SITE
         log = ImuLog(at_s, turns(at_s, 1), turns(at_s).inv().apply(places(at_s, 2) - gravity))
         prior = SensorPrior(log.step_s / np.sqrt(12), GIVEN_TURN_STDDEV_RAD, ARM_STDDEV_M)
-        problem = InertialProblem(log, path, mounting, prior, bending)
+        problem = InertialProblem(log, mounting, prior, bending)
         state = replace(InertialState.at_rest(gravity, mounting, len(path)), velocities_m_s=places(times_s, 1))
         return InertialScale(problem, state, self.sizes, problem.summed_up(state, self.sizes))

@@ -87,14 +87,14 @@ class MapBending(Protocol):
 
     @property
     def path(self) -> Trajectory:
-        """Return the path of k poses that is bent, in the model's world."""
+        """Return the path of k poses that is bent, in the map's world and unit."""
         ...
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         """Return the bending of c functions of the path, such as coordinates.
 
         Args:
-            by_pose: (c, 6 k) derivatives.
+            by_pose: (c, 6 k) derivatives by turns of the poses in their own frames, and by shifts in the map's world.
             frame_is_free: whether the map's place is estimated; otherwise it is fixed to the first pose.
         """
         ...
@@ -117,7 +117,7 @@ def without_similarity(by_pose: Array, path: Trajectory, is_firm: Mask, *, frame
     free; otherwise it is that of the first pose.
 
     Args:
-        path: the k poses, in the model's world.
+        path: the k poses, in the map's world.
         is_firm: (k,) True for the poses whose centres count. One that hangs loose on the others may be anywhere, and
             would make size and place of the whole map as uncertain.
     """
@@ -167,7 +167,7 @@ class WalkBending:
     these are random walks along the path.
 
     Attributes:
-        given: the original path, in the model's world.
+        given: the original path, in the map's world.
         steps: (s, 7) corrections at some of the poses: logarithm of the scale, turn and shift, in units of the walks'
             standard deviations from start to end; empty: no correction.
         frame_is_free: as in ``of_functions``, for the corrected path.

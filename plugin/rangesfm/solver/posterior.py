@@ -34,8 +34,7 @@ class Observations(LinearMap):
 
     Attributes:
         kind: its name.
-        by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in the frame and
-            in the unit in which ``MapBending`` has the path.
+        by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in its world.
         components: of their errors, without the bending of the map.
         alone_m2: (c, c) covariance as if each single one erred independently.
         is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.

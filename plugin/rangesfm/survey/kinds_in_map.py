@@ -48,21 +48,25 @@ class MapOfPhotos:
     """A map in which measurements are to be located.
 
     Attributes:
-        model: the map. path: of its keyframes. bending: of the map.
+        model: the map. bending: of the path of its keyframes.
         survey: options. observations: ranges of the log on the path of the unscaled model.
-        metres_per_unit: of the unscaled model, in the world of the path.
+        metres_per_unit: of the unscaled model, in the world of the map.
         before: the kinds on the map before its refinement; empty for a map that moves as one piece.
         rest: the map at rest; None for a map that moves as one piece.
     """
 
     model: pycolmap.Reconstruction
-    path: Trajectory
     bending: MapBending
     survey: Survey
     observations: RangeObservations
     metres_per_unit: float = 1.0
     before: tuple[KindOnMap, ...] = ()
     rest: MapAtRest | None = None
+
+    @property
+    def path(self) -> Trajectory:
+        """Of the keyframes."""
+        return self.bending.path
 
 
 def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
@@ -71,11 +75,11 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
         return None
     if at.rest is not None and before is not None:
         ranges = ranges_of(at.rest.problem.kinds)
-        return RangesAtRest(before, at.path, at.metres_per_unit, ranges, at.rest.state, at.bending)
+        return RangesAtRest(before, at.metres_per_unit, ranges, at.rest.state, at.bending)
     if inputs.tape.distances:
         distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
     return RangesOnPath(
-        *(at.observations, at.path, at.bending, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
+        *(at.observations, at.bending, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
         gravity=gravity_of(survey.scale.up_in_first_camera),
         camera_side=survey.scale.camera_side,
         site=inputs.site,
@@ -88,7 +92,7 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     known, before = surveyed.located(at.model, at.path), find_kind(at.before, PositionScale)
     if not len(known):
         return None
-    begun = PositionScale.begun(known, at.path, at.bending, surveyed, at.metres_per_unit, is_at_rest=bool(at.before))
+    begun = PositionScale.begun(known, at.bending, surveyed, is_at_rest=bool(at.before))
     if known.is_check.all() or (before is not None and not before.is_used):
         return begun
     try:
@@ -113,15 +117,14 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
         return None
     found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path.frame_ids)
     if (before := find_kind(at.before, LengthScale)) is not None:
-        return before.on_refined_map(found, at.path, at.bending, at.metres_per_unit)
-    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, inputs.tape.distances)
+        return before.on_refined_map(found, at.bending)
+    return lengths_between_points(found, at.bending, inputs.tape.distances)
 
 
 def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
     if inputs.imu is None or inputs.imu.alignment is None:
         return None
-    alignment, size = inputs.imu.alignment, at.metres_per_unit
-    return scale_by_sensor(InertialProblem.of_sensor(inputs.imu, alignment, at.path, at.bending, size))
+    return scale_by_sensor(InertialProblem.of_sensor(inputs.imu, inputs.imu.alignment, at.bending))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.files.photo_names import told_none, told_unknown
 from rangesfm.util.geometry.moments import ByPhoto
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PathOfModel:
     @property
     def as_walk(self) -> WalkBending:
         """How the model is bent if it drifts as a map of poses does."""
-        return WalkBending(in_first_camera(self.trajectory))
+        return WalkBending(self.trajectory)
 
 
 @dataclass(frozen=True)
@@ -145,12 +145,12 @@ class SurveyRun:
             GeometryError: the scale is not determined.
         """
         log = path.observations
-        at = MapOfPhotos(path.sfm, path.trajectory, bending, self.survey, log)
+        at = MapOfPhotos(path.sfm, bending, self.survey, log)
         located, remarks = kinds_in_map(self.inputs, at)
         if not located and remarks:
             raise GeometryError(f"the scale is not determined: {'; '.join(remarks)}")
         begun = RangeEstimate.begun(log, self.survey.ranges)
-        return estimate_scale(located, path.trajectory, bending, self.survey.scale, begun).remarked(remarks)
+        return estimate_scale(located, bending, self.survey.scale, begun).remarked(remarks)
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

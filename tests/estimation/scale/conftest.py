@@ -24,7 +24,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 
@@ -103,7 +103,7 @@ class Survey:
 
 def lengths_among(distances: LocatedDistances, path: Trajectory) -> list[LengthScale]:
     """Return the lengths between points among measured distances, if there are any, for ``initialize_scale``."""
-    found = lengths_between_points(distances, path, WalkBending(in_first_camera(path)))
+    found = lengths_between_points(distances, WalkBending(path))
     return [] if found is None else [found]
 
 

@@ -31,7 +31,7 @@ from rangesfm.options import RangeModelOptions, RangesOptions, ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from tests.estimation.scale.conftest import MakeSurvey, Survey
@@ -512,8 +512,8 @@ def of_no_ranges(*kinds: KindOnMap) -> ScaleEstimate:
 def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain() -> None:
     known_m = points_in_site(3, 0.5)
     known_m = replace(known_m, covariance_m2=100 * known_m.covariance_m2)
-    bending = WalkBending(in_first_camera(turned_path()))
-    positions = scale_by_positions(PositionScale.begun(known_m, turned_path(), bending))
+    bending = WalkBending(turned_path())
+    positions = scale_by_positions(PositionScale.begun(known_m, bending))
     [lengths] = lengths_among(taped(0.502, 0.001), turned_path())
     alone, both = of_no_ranges(positions), of_no_ranges(positions, lengths)
     assert (both.method, both.frame) == ("positions", "site")

@@ -179,7 +179,7 @@ def test_short_lengths_are_said_to_be_short() -> None:
 
     def judged(num: int, uncertainty: ScaleUncertainty) -> Verdict:
         one = np.ones(num)
-        lengths = known(lengths_between_points(LocatedDistances.between_points(one, one, one), path, WalkBending(path)))
+        lengths = known(lengths_between_points(LocatedDistances.between_points(one, one, one), WalkBending(path)))
         return judge(lengths.doubts(uncertainty), (), uncertainty, ScaleOptions())
 
     assert judged(2, narrow).verdict == "good"

@@ -25,7 +25,6 @@ from rangesfm.measurements.ranges.scale.starts import (
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, path_shape
-from rangesfm.util.geometry.trajectory import in_first_camera
 
 if TYPE_CHECKING:
     from tests.estimation.scale.conftest import MakeSurvey, Survey
@@ -51,8 +50,8 @@ def placed_at(similarity: Similarity, num: int = 60, gravity: Gravity | None = N
 
 def unknown_anchors(survey: Survey) -> RangeProblem:
     anchors = survey.anchors("unknown", "")
-    bending = WalkBending(in_first_camera(survey.trajectory))
-    given = RangesOnPath(survey.observations(), survey.trajectory, bending, anchors, "unknown")
+    bending = WalkBending(survey.trajectory)
+    given = RangesOnPath(survey.observations(), bending, anchors, "unknown")
     return scale_problem(given).ranges
 
 

@@ -92,7 +92,7 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
     gravity = GRAVITY_M_S2 * exponentials(np.array([[0.03, -0.02, 0.0]]))[0] @ DOWN
     state = InertialState.at_rest(gravity, MOUNTING, num)
     covariance = intervals.covariance(np.array([2e-4, 3e-3]))
-    problem = InertialProblem(log, path, MOUNTING, PRIOR, WalkBending(path))
+    problem = InertialProblem(log, MOUNTING, PRIOR, WalkBending(path))
 
     def measured(points: NamedPoints) -> Measurements:
         return motions_on_map(problem, state, intervals, covariance, points.state.poses, RefineOptions())
@@ -112,7 +112,7 @@ def test_drift_of_scale_and_tilt_is_gone_and_what_is_left_is_as_large_as_said(se
     log = ImuLog(log.timestamp_s, log.gyro_rad_s, (1 + scale_errors) * log.accel_m_s2)
     true, drifted = drift(made)
     path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
-    sensor = scale_by_sensor(InertialProblem(log, path, MOUNTING, PRIOR, WalkBending(path)))
+    sensor = scale_by_sensor(InertialProblem(log, MOUNTING, PRIOR, WalkBending(path)))
     placed = sensor.alone.estimate
     metric = rescale(made.reconstruction, placed)
     rest = refined(metric, path, lambda points: next(sensor.measurements(sensor.alone, points, RefineOptions())))

@@ -34,7 +34,7 @@ def posed(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialProbl
     """Return a log with scale errors on the path of photos."""
     log, path = imu_log(motion, seed=seed), photos(motion, noise_rad=3e-4)
     log = ImuLog(log.timestamp_s, log.gyro_rad_s, (1 + accel_scale) * log.accel_m_s2)
-    return InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, WalkBending(path))
+    return InertialProblem(log, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, WalkBending(path))
 
 
 def located(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialScale:
@@ -67,7 +67,7 @@ def test_errors_of_photos_on_an_even_walk_do_not_make_the_map_smaller() -> None:
         motion = by_walk(seed)
         path = photos(motion, every_s=0.5, noise_rad=5e-4, noise_m=0.005, seed=seed)
         mounting, log = Mounting(CAM_FROM_IMU, np.zeros(3)), imu_log(motion, grade=PHONE, seed=seed)
-        found = scale_by_sensor(InertialProblem(log, path, mounting, PRIOR, WalkBending(path))).alone
+        found = scale_by_sensor(InertialProblem(log, mounting, PRIOR, WalkBending(path))).alone
         errors.append([np.log(found.scale.value / METRES_PER_UNIT), found.posterior.uncertainty.empirical])
     off, stddev = np.transpose(errors)
     assert abs(off.mean()) < 0.05
@@ -92,7 +92,7 @@ def test_the_sensor_corrects_the_shape_of_a_map_by_bad_photos_and_not_only_its_s
         path = trajectory_from_reconstruction(model, made.timestamps_s)
         bending = bending_of_model(model, path, CameraOptions(refine_intrinsics=False), RefineOptions(), 1)
         log = imu_log(motion, grade=PHONE, seed=seed)
-        found = scale_by_sensor(InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, bending)).alone
+        found = scale_by_sensor(InertialProblem(log, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR, bending)).alone
         off = np.log(found.scale.value / align_points(path.centers, made.centers_m).scale)
         assert abs(off) < 0.008
         assert found.posterior.uncertainty.half_width_95 < 0.01

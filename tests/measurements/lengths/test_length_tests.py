@@ -22,7 +22,7 @@ def test_what_a_length_could_do_unfound_is_what_the_scale_does_when_it_is_so_muc
     path = Trajectory(np.arange(20), names, np.arange(20.0), centers, still)
 
     def by(distances: LocatedDistances) -> LengthScale:
-        lengths = known(lengths_between_points(distances, path, WalkBending(path), taped=taped))
+        lengths = known(lengths_between_points(distances, WalkBending(path), taped=taped))
         return lengths.tested(lengths.start, ())
 
     located = LocatedDistances.between_points(lengths_m, stddevs_m, lengths_m / 2)

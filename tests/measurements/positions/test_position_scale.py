@@ -73,7 +73,7 @@ def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    fit = scale_by_positions(PositionScale.begun(replace(wrong, is_check=~used), path(), WalkBending(path())))
+    fit = scale_by_positions(PositionScale.begun(replace(wrong, is_check=~used), WalkBending(path())))
     assert_same(fit.similarity, SITE_FROM_MODEL)
     np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(fit.stddev_m, 0.1)
@@ -94,8 +94,8 @@ def test_three_positions_off_a_line_determine_a_similarity() -> None:
 def test_too_few_positions_are_refused_with_their_number() -> None:
     positions = replace(survey([True] * 4), is_check=np.array([False, True, True, False]))
     with pytest.raises(GeometryError, match=r"^2 known positions are in the map, expected 3 or more that are not on"):
-        scale_by_positions(PositionScale.begun(positions, path(), WalkBending(path())))
-    scale_by_positions(PositionScale.begun(replace(positions, is_check=np.arange(4) == 1), path(), WalkBending(path())))
+        scale_by_positions(PositionScale.begun(positions, WalkBending(path())))
+    scale_by_positions(PositionScale.begun(replace(positions, is_check=np.arange(4) == 1), WalkBending(path())))
 
 
 @pytest.mark.parametrize("row", [1, 2, 3])

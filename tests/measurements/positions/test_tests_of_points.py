@@ -38,7 +38,7 @@ class Held(KindOnMap):
 
     @property
     def alone(self) -> JointMap:
-        return join_kinds((self,), PATH, IDENTITY, WalkBending(PATH))
+        return join_kinds((self,), IDENTITY, WalkBending(PATH))
 
     def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
         assert in_site, "it places the map"
@@ -82,10 +82,10 @@ def found_in(
         is_check=np.array([kind == "check" for kind in of_points]),
     )
     bending, surveyed = WalkBending(PATH), SurveyedPositions(ControlPoints(points))
-    positions = PositionScale.begun(known, PATH, bending, surveyed, is_at_rest=True)
+    positions = PositionScale.begun(known, bending, surveyed, is_at_rest=True)
     if of_points.count("control") >= 3:
         positions = scale_by_positions(positions)
-    return positions.tests(join_kinds((Held(stddev), positions), PATH, IDENTITY, bending, is_at_rest=True), {})
+    return positions.tests(join_kinds((Held(stddev), positions), IDENTITY, bending, is_at_rest=True), {})
 
 
 def rejected(found: MistakeTests) -> list[tuple[str, str]]:
@@ -143,6 +143,6 @@ def test_control_points_of_which_any_may_be_wrong_are_all_named() -> None:
 def test_points_in_a_map_that_nothing_places_are_not_found_in() -> None:
     known = replace(known_positions([True] * 4, 3), is_check=np.ones(4, dtype=bool))
     bending = WalkBending(PATH)
-    alone = PositionScale.begun(known, PATH, bending)
-    in_site = join_kinds((Held(TIGHT),), PATH, IDENTITY, bending)
+    alone = PositionScale.begun(known, bending)
+    in_site = join_kinds((Held(TIGHT),), IDENTITY, bending)
     assert alone.tests(in_site, {}).tests == ()

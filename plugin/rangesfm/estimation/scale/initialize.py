@@ -34,7 +34,7 @@ from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.gravity import gravity_of
-from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 
@@ -71,9 +71,9 @@ def initialize_scale(
         InputError: an anchor of the log is not among ``anchors``.
         GeometryError: the scale is not determined.
     """
-    bending = bending or WalkBending(in_first_camera(trajectory))
+    bending = bending or WalkBending(trajectory)
     ranges = RangesOnPath(
-        *(observations, trajectory, bending, anchors, anchor_frame, range_model, distances),
+        *(observations, bending, anchors, anchor_frame, range_model, distances),
         gravity=gravity_of(options.up_in_first_camera),
         camera_side=options.camera_side,
         site=site,
@@ -81,11 +81,11 @@ def initialize_scale(
     )
     log = RangeEstimate.begun(observations, range_model)
     located = (ranges, *others) if len(observations.log) else others
-    return estimate_scale(located, trajectory, bending, options, log)
+    return estimate_scale(located, bending, options, log)
 
 
 def estimate_scale(
-    located: Sequence[Located], path: Trajectory, bending: MapBending, options: ScaleOptions, log: RangeEstimate
+    located: Sequence[Located], bending: MapBending, options: ScaleOptions, log: RangeEstimate
 ) -> ScaleEstimate:
     """Estimate scale and frame of an unscaled path from all that is measured in its map.
 
@@ -96,7 +96,7 @@ def estimate_scale(
     Raises:
         GeometryError: the scale is not determined.
     """
-    on_map, by_kind = _started(located, path, bending)
+    on_map, by_kind = _started(located, bending)
     on_map = on_map.concluded()
     judged, known = judge_map_of_kinds(on_map, options), on_map.posterior
     used = [each for each in on_map.kinds if each.is_used]
@@ -119,9 +119,7 @@ def estimate_scale(
     return _by_paper(estimate, is_checked=options.method == "two-candidate")
 
 
-def _started(
-    located: Sequence[Located], path: Trajectory, bending: MapBending
-) -> tuple[JointMap, Mapping[str, ScaleByKind]]:
+def _started(located: Sequence[Located], bending: MapBending) -> tuple[JointMap, Mapping[str, ScaleByKind]]:
     """Return the map fitted as one piece to all kinds, without what contradicts all else, and the scale by each alone.
 
     What is left out is first found without the kinds that are solved beside the others, and then once more with them.
@@ -152,7 +150,7 @@ def _started(
         others = tuple(each for each in kinds if not each.is_solved)
         if [each.left_out for each in others] == [each.left_out for each in before]:
             break
-    return fit_kinds(kinds, path, placed, bending), by_kind
+    return fit_kinds(kinds, placed, bending), by_kind
 
 
 def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:

@@ -94,34 +94,24 @@ class InertialProblem:
     """A log between the photos of a path.
 
     Attributes:
-        log: on the clock of the photos.
-        path: of the n photos, with times. mounting: of the sensor in the rig, as known before.
+        log: on the clock of the photos. mounting: of the sensor in the rig, as known before.
         prior: what is known of the sensor's numbers, and of errors of clock and mounting.
-        bending: of the path. metres_per_unit: units of the path in one unit of that which ``bending`` has.
+        bending: of the path of the n photos, which has times.
         bending_factor: how much larger that is than expected from the photos' residuals (section 3).
         time_offset_s: what was added to the times of the log as it was read.
     """
 
     log: ImuLog
-    path: Trajectory
     mounting: Mounting
     prior: SensorPrior
     bending: MapBending
-    metres_per_unit: float = 1.0
     bending_factor: float = 1.0
     time_offset_s: float = 0.0
     _bent: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of_sensor(
-        cls,
-        sensor: InertialSensor,
-        found: ImuAlignment,
-        path: Trajectory,
-        bending: MapBending,
-        metres_per_unit: float = 1.0,
-    ) -> InertialProblem:
-        """Return the log of a sensor that is aligned with the photos of a path; the others are attributes."""
+    def of_sensor(cls, sensor: InertialSensor, found: ImuAlignment, bending: MapBending) -> InertialProblem:
+        """Return the log of a sensor that is aligned with the photos of a path, given how that is bent."""
         log = replace(found.log, timestamp_s=found.log.timestamp_s + found.time_offset_s)
         turn_rad = float(np.sqrt(np.linalg.eigvalsh(found.rotation_covariance)[-1]))
         prior = SensorPrior(
@@ -133,7 +123,12 @@ class InertialProblem:
         noise = sensor.log.noise
         prior = prior if noise is None else prior.with_given(noise)
         mounting = Mounting(found.cam_from_imu, arm)
-        return cls(log, path, mounting, prior, bending, metres_per_unit, time_offset_s=found.time_offset_s)
+        return cls(log, mounting, prior, bending, time_offset_s=found.time_offset_s)
+
+    @property
+    def path(self) -> Trajectory:
+        """Of the photos."""
+        return self.bending.path
 
     @property
     def times_s(self) -> Array:
@@ -222,11 +217,8 @@ class InertialProblem:
             by_pose = np.zeros((6 * num, 6 * len(self.path)))
             by_pose[np.arange(6 * num), (6 * photos[:, None] + np.arange(6)).ravel()] = 1.0
             self._bent[key] = self.bending.of_functions(by_pose, frame_is_free=False).formal_m2
-        found = self.bending_factor**2 * self._bent[key]
-        to_metric = block_diag(np.eye(3), scale * self.metres_per_unit * self.path.world_from_cam[0])
-        return np.asarray(np.einsum("ij,pjqk,lk->piql", to_metric, found.reshape(num, 6, num, 6), to_metric)).reshape(
-            6 * num, 6 * num
-        )
+        to_metric = self.bending_factor * np.tile(np.repeat([1.0, scale], 3), num)
+        return np.asarray(to_metric[:, None] * self._bent[key] * to_metric)
 
     def off_prior(self, state: InertialState) -> Array:
         """Return the (29,) differences of the shared numbers from what was known of them; 0 where nothing was."""

@@ -82,7 +82,7 @@ class InertialScale(KindOnMap):
     @cached_property
     def alone(self) -> JointMap:
         """The map by the log alone."""
-        return fit_kinds((self,), self.problem.path, self.start, self.problem.bending)
+        return fit_kinds((self,), self.start, self.problem.bending)
 
     @cached_property
     def upward(self) -> Gravity:
@@ -185,10 +185,9 @@ class InertialScale(KindOnMap):
     def _observations(self, made: Combinations) -> Observations:
         """Return the observations that are made of all errors."""
         problem, motion, state = self.problem, made.motion, made.motion.state
-        path, by_pose = problem.path, made.by_photos(motion.errors.by_pose, len(problem.path))
+        by_pose = made.by_photos(motion.errors.by_pose, len(problem.path))
         of_shared, nothing = made.of(motion.shared), np.zeros(0, dtype=np.int64)
         components = tuple(self._components(made, by_pose, of_shared))
-        by_shift = state.scale * problem.metres_per_unit * by_pose[:, :, 3:] @ path.world_from_cam[0]
         known = [each.alike for each in components if each.spread == 0]
         assumed = [self.sizes[each.name] ** 2 * each.alike for each in components if each.name in self.sizes]
         covariance = np.asarray(np.sum([*known, *assumed], axis=0))
@@ -198,7 +197,7 @@ class InertialScale(KindOnMap):
             design=of_shared[:, SCALE],
             # Constant errors of the sensor are about what was known of it before.
             residual_m=made.of(motion.errors.residual) - of_shared @ problem.off_prior(state),
-            by_pose=np.concatenate([by_pose[:, :, :3], by_shift], axis=2).reshape(len(by_pose), -1),
+            by_pose=(by_pose * np.repeat([1.0, state.scale], 3)).reshape(len(by_pose), -1),
             components=components,
             alone_m2=covariance,
             is_used=np.ones(len(by_pose), dtype=bool),

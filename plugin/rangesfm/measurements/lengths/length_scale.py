@@ -39,8 +39,7 @@ class LengthScale(KindOnMap):
     """m measured lengths between points of a map, and what all else says of them.
 
     Attributes:
-        lengths: in the model of ``path``. rows: (m,) of them among all distances.
-        bending: of the map. metres_per_unit: as of ``lengths_on_map``.
+        lengths: in the map. rows: (m,) of them among all distances. bending: of the map.
         is_kept: (m,) True for lengths that agree with all else; the others are not used. Where none is kept, the scale
             alone is that of all of them.
         too_long_m, stddev_m: (m,) excess of each length over what all other kept measurements predict, and its standard
@@ -51,9 +50,7 @@ class LengthScale(KindOnMap):
 
     lengths: LocatedDistances
     rows: Indices
-    path: Trajectory
     bending: MapBending
-    metres_per_unit: float
     is_kept: Mask
     too_long_m: Array
     stddev_m: Array
@@ -68,19 +65,19 @@ class LengthScale(KindOnMap):
     ) -> Observations:
         """Linearise the lengths about the scale of a placement."""
         del in_site, max_num
-        return lengths_on_map(self.lengths, placed.scale, self.path, self.is_kept, metres_per_unit=self.metres_per_unit)
+        return lengths_on_map(self.lengths, placed.scale, len(self.bending.path), self.is_kept)
 
     @property
     def start(self) -> Similarity:
         """The placement with the median of the scales by the kept lengths."""
         scales = self.lengths.distance_m / self.lengths.model_length
-        return first_camera_from(self.path, float(np.median(scales[self.is_kept])))
+        return first_camera_from(self.bending.path, float(np.median(scales[self.is_kept])))
 
     @cached_property
     def alone(self) -> JointMap:
         """The map by the kept lengths alone."""
         used = self if self.is_used else replace(self, is_kept=~self.is_kept)
-        return fit_kinds((used,), self.path, used.start, self.bending)
+        return fit_kinds((used,), used.start, self.bending)
 
     @property
     def is_used(self) -> bool:
@@ -107,19 +104,16 @@ class LengthScale(KindOnMap):
         """(m,) relative change of the scale by the lengths if the length was a metre longer."""
         return self.alone.problem.of_kind(LENGTHS, self.alone.posterior.gains)
 
-    def on_refined_map(
-        self, distances: LocatedDistances, path: Trajectory, bending: MapBending, metres_per_unit: float
-    ) -> LengthScale:
+    def on_refined_map(self, distances: LocatedDistances, bending: MapBending) -> LengthScale:
         """Return the same lengths on the map that this one became, with the same ones left out.
 
         Args:
-            distances: all measured ones in the refined map. Others as of the lengths.
+            distances: all measured ones in the refined map. bending: of that.
 
         Raises:
             GeometryError: both ends of a length are in one place of the map.
         """
-        lengths = _subset(distances, self.rows, path)
-        return replace(self, lengths=lengths, path=path, bending=bending, metres_per_unit=metres_per_unit)
+        return replace(self, lengths=_subset(distances, self.rows, bending.path), bending=bending)
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that nothing checks a single length, and that the lengths are too short."""
@@ -225,11 +219,7 @@ class LengthScale(KindOnMap):
 
 
 def lengths_between_points(
-    distances: LocatedDistances,
-    path: Trajectory,
-    bending: MapBending,
-    metres_per_unit: float = 1.0,
-    taped: Sequence[TapedDistance] = (),
+    distances: LocatedDistances, bending: MapBending, taped: Sequence[TapedDistance] = ()
 ) -> LengthScale | None:
     """Return the lengths among measured distances, before any test; None where there is none between points.
 
@@ -242,9 +232,9 @@ def lengths_between_points(
     rows = np.flatnonzero(distances.is_between_points & ~distances.is_check)
     if not len(rows):
         return None
-    lengths, nothing, every = _subset(distances, rows, path), np.zeros(len(rows)), np.ones(len(rows), dtype=bool)
+    lengths, nothing = _subset(distances, rows, bending.path), np.zeros(len(rows))
     given = tuple(taped[row] for row in rows.tolist()) if taped else ()
-    return LengthScale(lengths, rows, path, bending, metres_per_unit, every, nothing, nothing + np.inf, nothing, given)
+    return LengthScale(lengths, rows, bending, nothing == 0, nothing, nothing + np.inf, nothing, given)
 
 
 def _subset(distances: LocatedDistances, rows: Indices, path: Trajectory) -> LocatedDistances:

@@ -11,7 +11,6 @@ from rangesfm.measurements.lengths.words import LENGTHS
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations
-from rangesfm.util.geometry.trajectory import Trajectory
 
 BENDING = 0.008
 """Relative variation of the scale within a map (standard deviation), for lengths at unknown places.
@@ -20,16 +19,13 @@ Source: lengths of 0.5 to 5 m against the truth in a room mapped with a hand-hel
 """
 
 
-def lengths_on_map(
-    lengths: LocatedDistances, scale: float, path: Trajectory, is_used: Mask, *, metres_per_unit: float = 1.0
-) -> Observations:
+def lengths_on_map(lengths: LocatedDistances, scale: float, num_poses: int, is_used: Mask) -> Observations:
     """Linearise lengths between points about the scale of a map.
 
     Args:
-        lengths: of which all are between points, in the model of ``path``.
-        scale: metres per unit of that model.
+        lengths: of which all are between points, in the model of the path.
+        scale: metres per unit of that model. num_poses: of the path.
         is_used: (m,) lengths that take part.
-        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
     """
     num, nothing = len(lengths), np.zeros(0, dtype=np.int64)
     grown_m, printed = scale * lengths.model_length, lengths.is_printed
@@ -37,14 +33,12 @@ def lengths_on_map(
     alone = ~(printed[:, None] & printed) & ~np.eye(num, dtype=bool)
     tape_m2 = np.where(alone, 0.0, np.outer(lengths.stddev_m, lengths.stddev_m))
     marks_m2 = np.diag((scale * lengths.mark_stddev) ** 2)
-    by_pose = scale * csr_array(lengths.by_pose, shape=(num, 6 * len(path))).toarray().reshape(num, len(path), 6)
-    by_pose[:, :, 3:] = metres_per_unit * by_pose[:, :, 3:] @ path.world_from_cam[0]
     return Observations(
         kind=LENGTHS,
         columns=Columns(0, -1, nothing, nothing, 1),
         design=grown_m[:, None],
         residual_m=grown_m - lengths.distance_m,
-        by_pose=by_pose.reshape(num, -1),
+        by_pose=scale * csr_array(lengths.by_pose, shape=(num, 6 * num_poses)).toarray(),
         components=(Component("tape", tape_m2), Component("marks", marks_m2)),
         alone_m2=np.diag(lengths.stddev_m**2) + marks_m2,
         is_used=is_used,

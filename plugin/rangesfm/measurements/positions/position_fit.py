@@ -110,16 +110,11 @@ def design_of_positions(known: KnownPositions, site_from_model: Similarity, path
     return motions.reshape(-1, 7)
 
 
-def groups_by_pose(known: KnownPositions, similarity: Similarity, path: Trajectory, grouping: csr_array) -> Array:
-    """Return (3 g, 6 n) derivatives of groups of positions by the poses of a path, with shifts as in its first camera.
-
-    These are the axes in which ``MapBending`` has the shifts.
-    """
+def groups_by_pose(known: KnownPositions, similarity: Similarity, grouping: csr_array) -> Array:
+    """Return (3 g, 6 n) derivatives of groups of positions by the poses of the path they are on."""
     rotation = kron(np.eye(len(known)), similarity.rotation, format="csr")
     by_pose = grouping @ rotation @ (similarity.scale * known.by_pose + known.arms_by_pose)
-    parts = by_pose.toarray().reshape(by_pose.shape[0], -1, 6)
-    parts[:, :, 3:] = parts[:, :, 3:] @ path.world_from_cam[0]
-    return np.asarray(parts.reshape(len(parts), -1))
+    return np.asarray(by_pose.toarray())
 
 
 def at_point(known: KnownPositions, row: int) -> Array:

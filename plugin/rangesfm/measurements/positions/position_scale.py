@@ -44,7 +44,7 @@ from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
-from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
+from rangesfm.util.geometry.trajectory import moved_similarity
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
@@ -80,27 +80,24 @@ class PositionScale(KindOnMap):
     """k known positions on a map, and its scale and place by them alone.
 
     Attributes:
-        known: the positions. path: of the camera, in the model that they are in. bending: of the map.
+        known: the positions. bending: of the map that they are in.
         surveyed: what the positions were given as.
         similarity: from that model to the site, as a robust fit of the positions alone has it.
         is_kept: (k,) those that take part in it: all but check points and control points that contradict the others;
             none where a map that others place is only compared with them.
         weights, stddev_m: (k,) its robust weights, and standard deviations of a coordinate that they assume.
-        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
         is_at_rest: whether photos and positions made the map together, in the site; otherwise it is one piece, and its
             similarity is estimated.
         notes: as of ``KindOnMap``.
     """
 
     known: KnownPositions
-    path: Trajectory
     bending: MapBending
     surveyed: SurveyedPositions
     similarity: Similarity
     is_kept: Mask
     weights: Array
     stddev_m: Array
-    metres_per_unit: float
     is_at_rest: bool
     notes: tuple[str, ...] = ()
 
@@ -112,17 +109,15 @@ class PositionScale(KindOnMap):
     def begun(
         cls,
         known: KnownPositions,
-        path: Trajectory,
         bending: MapBending,
         surveyed: SurveyedPositions = NO_POSITIONS,
-        metres_per_unit: float = 1.0,
         *,
         is_at_rest: bool = False,
     ) -> PositionScale:
         """Return positions of which none takes part yet."""
         none, nothing = np.zeros(len(known), dtype=bool), np.zeros(len(known))
         unfitted = (IDENTITY, none, nothing, nothing + 1.0)
-        return cls(known, path, bending, surveyed, *unfitted, metres_per_unit, is_at_rest)
+        return cls(known, bending, surveyed, *unfitted, is_at_rest)
 
     @property
     def start(self) -> Similarity:
@@ -132,10 +127,11 @@ class PositionScale(KindOnMap):
     @cached_property
     def alone(self) -> JointMap:
         """The map by the positions alone, about the similarity of their fit."""
-        return join_kinds((self,), self.path, self.similarity, self.bending, is_at_rest=self.is_at_rest)
+        return join_kinds((self,), self.similarity, self.bending, is_at_rest=self.is_at_rest)
 
     def fitted(self) -> PositionScale:
         """Return their fit by iteratively reweighted least squares, starting from this similarity."""
+        path = self.bending.path
         known, similarity, used = self.known, self.similarity, self.is_kept
         for _ in range(MAX_NUM_ROUNDS):
             off_m = known.misclosures_m(similarity)
@@ -145,9 +141,9 @@ class PositionScale(KindOnMap):
             if self.is_at_rest:  # the map has its place; only outliers are told apart
                 break
             root = np.repeat(np.sqrt(weights / stddev_m**2), 3)
-            by = root[:, None] * design_of_positions(known, similarity, self.path)
+            by = root[:, None] * design_of_positions(known, similarity, path)
             step = np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0], dtype=np.float64)
-            similarity = moved_similarity(similarity, step, self.path)
+            similarity = moved_similarity(similarity, step, path)
             if np.abs(step).max() < ROUNDING:
                 break
         return replace(self, similarity=similarity, weights=weights, stddev_m=stddev_m)
@@ -209,9 +205,7 @@ class PositionScale(KindOnMap):
         known, similarity = self.known, placed
         grouping = grouped_by_time(known, self.weights, max_num // 3)
         used = np.asarray((abs(grouping) @ np.repeat(self.used, 3)) > 0)
-        by_pose = groups_by_pose(known, similarity, self.path, grouping)
-        by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
-        design = grouping @ design_of_positions(known, similarity, self.path)
+        design = grouping @ design_of_positions(known, similarity, self.bending.path)
         variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
         weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
         nothing = np.zeros(0, dtype=np.int64)
@@ -220,7 +214,7 @@ class PositionScale(KindOnMap):
             columns=Columns(0, 1, nothing, nothing, 7),
             design=design,
             residual_m=grouping @ known.misclosures_m(similarity).ravel(),
-            by_pose=by_pose,
+            by_pose=groups_by_pose(known, similarity, grouping),
             components=components_of(known, similarity, grouping, self.stddev_m, self.surveyed, design, used),
             alone_m2=weighed,
             is_used=used,

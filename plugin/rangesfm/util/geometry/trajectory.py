@@ -156,11 +156,6 @@ def places_in_time(times: Array, keyframe_times: Array, *, max_gap_s: float, max
     return around.moved(~is_between, np.where(is_near, around.nearest, -1))
 
 
-def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
-    """Return a path in the frame of its first pose, in a new unit that is ``unit`` times its own."""
-    return trajectory.transformed(first_camera_from(trajectory, 1 / unit))
-
-
 def first_camera_from(trajectory: Trajectory, scale: float = 1.0) -> Similarity:
     """Return the similarity, a rigid motion by default, from the world of a path to the frame of its first camera."""
     rotation = trajectory.world_from_cam[0].T

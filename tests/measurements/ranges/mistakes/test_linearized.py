@@ -18,7 +18,7 @@ from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, Rang
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.solver.bending import Bending
-from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import OnPath
 
 NUM_POINTS, NUM_ANCHORS = 40, 3
@@ -78,16 +78,17 @@ def small_map(
             placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
         ),
         site=Site(),
-        trajectory=range(int(points.max()) + 2),
     )
     errors: Any = None
     rigid: Any = SimpleNamespace(
-        of_functions=lambda by_pose, frame_is_free: Bending((), np.zeros((len(by_pose),) * 2), np.zeros(len(by_pose)))
+        path=range(int(points.max()) + 2),
+        of_functions=lambda by_pose, frame_is_free: Bending((), np.zeros((len(by_pose),) * 2), np.zeros(len(by_pose))),
     )
     return RangesOnMap(
         posed=ScaleProblem(
             given=given,
             ranges=problem,
+            model_from_path=IDENTITY,
             model_from_cam=model_from_cam,
             velocity=velocity if has_times else None,
             rows=np.arange(num),

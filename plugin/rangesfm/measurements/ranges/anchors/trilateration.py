@@ -279,9 +279,9 @@ def _on_given_path(
         # Nothing depends on the scale of a camera that stands still, and this keeps it as it is.
         distances=LocatedDistances.between_points(*np.ones((3, 1))),
     )
-    given = RangesOnPath(observations, still, WalkBending(still), (), "unknown", model)
+    given = RangesOnPath(observations, WalkBending(still), (), "unknown", model)
     upright = np.tile(np.eye(3), (len(rows), 1, 1))
-    return ScaleProblem(given, ranges, upright, None, rows, (), ())
+    return ScaleProblem(given, ranges, IDENTITY, upright, None, rows, (), ())
 
 
 def _located(posed: ScaleProblem) -> Iterator[tuple[int, Linearized, RangesOnMap]]:

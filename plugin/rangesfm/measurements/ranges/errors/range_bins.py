@@ -122,21 +122,17 @@ def range_bins(
 
 
 def by_poses(
-    gradient: RangeGradient,
-    metric_from_model: Similarity,
-    model_from_cam: Array,
-    tag_from_center: Array,
-    on_path: OnPath,
+    gradient: RangeGradient, metric_from_path: Similarity, world_from_cam: Array, arms_m: Array, on_path: OnPath
 ) -> csr_array:
-    """Return (n, 6 k) derivatives of the distances by k poses: turns in their own frames, shifts in the model's world.
+    """Return (n, 6 k) derivatives of the distances by k poses: turns in their own frames, shifts in the path's world.
 
     Args:
-        model_from_cam: (n, 3, 3) rotations. tag_from_center: (n, 3) lever arms, metres, in the axes of the model.
+        world_from_cam: (n, 3, 3) rotations into the metric world. arms_m: (n, 3) lever arms in its axes.
     """
     num_poses = int(max(on_path.before.max(), on_path.after.max())) + 1
-    by_shift = metric_from_model.scale * gradient.by_tag @ metric_from_model.rotation
-    in_cam = np.einsum("nji,nj->ni", model_from_cam, gradient.by_tag @ metric_from_model.rotation)
-    by_turn = np.cross(np.einsum("nji,nj->ni", model_from_cam, tag_from_center), in_cam)
+    by_shift = metric_from_path.scale * gradient.by_tag @ metric_from_path.rotation
+    arms_in_cam_m, in_cam = (np.einsum("nji,nj->ni", world_from_cam, of) for of in (arms_m, gradient.by_tag))
+    by_turn = np.cross(arms_in_cam_m, in_cam)
     values = np.hstack([by_turn, by_shift])
     rows = np.repeat(np.arange(len(values)), 6)
     parts = [

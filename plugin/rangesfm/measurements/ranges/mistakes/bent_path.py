@@ -75,7 +75,7 @@ def as_given(on_map: RangesOnMap) -> RangesOnMap:
 
 def bends_m(on_map: RangesOnMap) -> Array:
     """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
-    walk, scale = on_map.bending, on_map.state.metric_from_model.scale
+    walk, scale = on_map.bending, on_map.metric_from_path.scale
     if not isinstance(walk, WalkBending) or not walk.is_corrected:
         return np.zeros(0)
     return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))

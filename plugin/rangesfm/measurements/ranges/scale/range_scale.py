@@ -41,7 +41,6 @@ from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Posterior, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.similarity import Similarity, rmse
-from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from
 
 
 @dataclass(frozen=True)
@@ -50,14 +49,11 @@ class RangeScale(KindOnMap):
 
     Attributes:
         solved: the ranges at their solution.
-        path: of the map. unit: of it in the units of the problem, which has the same path.
         told: what is said of the ranges, as far as it is known.
         notes: as of ``KindOnMap``.
     """
 
     solved: RangesOnMap
-    path: Trajectory
-    unit: float
     told: RangeEstimate
     notes: tuple[str, ...] = ()
 
@@ -72,7 +68,7 @@ class RangeScale(KindOnMap):
         """Return ranges at a solution on the path of the unscaled model."""
         given = solved.posed.given
         told = RangeEstimate.begun(given.observations, given.range_model)
-        return cls(solved, given.trajectory, 1.0, told, notes)
+        return cls(solved, told, notes)
 
     @property
     def places_map(self) -> bool:
@@ -89,13 +85,13 @@ class RangeScale(KindOnMap):
     @property
     def start(self) -> Similarity:
         """The placement of the solution."""
-        return self.solved.state.metric_from_model @ first_camera_from(self.path, self.unit)
+        return self.solved.metric_from_path
 
     @cached_property
     def alone(self) -> JointMap:
         """The map by the ranges alone, solved anew; from here, if they alone leave it open."""
         own = replace(self, solved=self._without_others)
-        return join_kinds((own,), self.path, own.start, self.solved.bending)
+        return join_kinds((own,), own.start, self.solved.bending)
 
     @cached_property
     def _without_others(self) -> RangesOnMap:
@@ -126,10 +122,10 @@ class RangeScale(KindOnMap):
 
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
         """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
-        turns, shifts_m = bent.at(self.path.frame_ids)
-        first_from_world = self.path.world_from_cam[0].T
-        in_first = Rotation.from_rotvec(np.einsum("ij,kjl,kl->ki", first_from_world, self.path.world_from_cam, turns))
-        posed = self.solved.posed.carried(in_first.as_matrix(), self.unit * shifts_m @ first_from_world.T)
+        path = self.solved.bending.path
+        turns, shifts_m = bent.at(path.frame_ids)
+        in_world = Rotation.from_rotvec(np.einsum("kij,kj->ki", path.world_from_cam, turns))
+        posed = self.solved.posed.carried(in_world.as_matrix(), shifts_m)
         return replace(self, solved=moved(replace(self.solved, posed=posed), known))
 
     def concluded(self, on_map: JointMap) -> RangeScale:
@@ -204,9 +200,8 @@ class RangeScale(KindOnMap):
             errors=replace(told.errors, stddev_m=stddev_m),
             anchors=tuple(replace(anchor, position_m=at_m) for anchor, at_m in places),
         )
-        placed = bent.state.metric_from_model @ first_camera_from(solved.posed.given.trajectory)
         doubts = tuple(doubts_of_ranges(solved, known.uncertainty, {}))
-        yield BentMap(replace(self, told=told), placed, known, doubts, remarks)
+        yield BentMap(replace(self, told=told), bent.metric_from_path, known, doubts, remarks)
 
     def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> Diagnosis:
         """Return the tests of all mistakes that ranges can show."""

@@ -25,7 +25,7 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import Similarity
-from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
+from rangesfm.util.geometry.trajectory import first_camera_from, moved_similarity
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class RangesOnPath(Located):
 
     Attributes:
         observations: all ranges of the log.
-        trajectory: path of the unscaled model. bending: of the map.
+        bending: of the path of the map.
         anchors: every anchor of the log, with its prior knowledge, in the order of their file.
         anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
             keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
@@ -50,7 +50,6 @@ class RangesOnPath(Located):
     """
 
     observations: RangeObservations
-    trajectory: Trajectory
     bending: MapBending
     anchors: Sequence[Anchor]
     anchor_frame: str
@@ -66,7 +65,7 @@ class RangesOnPath(Located):
     def posed(self, others: Sequence[KindOnMap], *, place_is_open: bool = False) -> ScaleProblem:
         """Return their problem beside the other kinds; argument and errors as of ``scale_problem``."""
         distances, gravity = with_lengths(self.distances, others), upward_by(others, self.gravity)
-        placement = placement_by(others, first_camera_from(self.trajectory))
+        placement = placement_by(others, first_camera_from(self.bending.path))
         return scale_problem(
             replace(self, distances=distances, gravity=gravity), placement, place_is_open=place_is_open
         )
@@ -91,12 +90,11 @@ class RangesAtRest(Located):
 
     Attributes:
         before: on the scaled map.
-        path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
-        ranges: as weighted in the refined map. state: of it. bending: of it.
+        scale: metres of the refined map per unit of the unscaled model.
+        ranges: as weighted in the refined map. state: of it. bending: of its path, in the metric world.
     """
 
     before: RangeScale
-    path: Trajectory
     scale: float
     ranges: Ranges
     state: MapState
@@ -106,31 +104,35 @@ class RangesAtRest(Located):
 
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges where the map has them."""
-        path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.solved.posed
-        unit, trajectory = 1 / scale, path.transformed(Similarity(1 / scale, np.eye(3), np.zeros(3)))
+        path, scale, ranges, posed = self.bending.path, self.scale, self.ranges, self.before.solved.posed
         # The model's frame is that of the first camera, in the unit of the unscaled model.
-        model_from_metric = first_camera_from(path, unit)
-        placed = model_from_metric.inverse()
+        model_from_path = first_camera_from(path, 1 / scale)
+        placed = model_from_path.inverse()
         tags_m, centers_m = ranges.antennas_m(self.state)
         problem = replace(
             posed.ranges,
-            centers=model_from_metric.apply(centers_m),
+            centers=model_from_path.apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
             distances=with_lengths(posed.ranges.distances, others, scale),
-            placement=placement_by(others, model_from_metric),
+            placement=placement_by(others, model_from_path),
         )
-        turns, velocity = turns_and_velocities(posed.observations, posed.rows, trajectory)
-        given = replace(posed.given, trajectory=trajectory, bending=self.bending)
-        posed = replace(posed, given=given, ranges=problem, model_from_cam=turns, velocity=velocity)
+        unscaled = path.transformed(Similarity(1 / scale, np.eye(3), np.zeros(3)))
+        turns, velocity = turns_and_velocities(posed.observations, posed.rows, unscaled)
+        posed = replace(
+            posed,
+            given=replace(posed.given, bending=self.bending),
+            ranges=problem,
+            model_from_path=model_from_path,
+            model_from_cam=turns,
+            velocity=velocity,
+        )
         ids, blocks = posed.observations.log.anchor_ids, self.state.blocks
         anchors_m, biases_m = np.array([blocks["anchor", id_] for id_ in ids]), [blocks["bias", id_][0] for id_ in ids]
         state = RangeState(placed, anchors_m, np.array(biases_m))
         weighted, errors = posed.weighted(ranges.errors), ranges.errors
         off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
         fit, noise_m = fit_at(weighted, state, errors.robust_weights(off_m)), float(np.median(errors.stddev_m))
-        return RangeScale(
-            RangesOnMap.at(posed, weighted, fit, errors, noise_m), path, unit, self.before.told, self.before.notes
-        )
+        return RangeScale(RangesOnMap.at(posed, weighted, fit, errors, noise_m), self.before.told, self.before.notes)
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:

@@ -32,6 +32,7 @@ from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component
+from rangesfm.util.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,11 @@ class RangesOnMap:
         return self.posed.observations.log.tag_index[self.posed.rows]
 
     @property
+    def metric_from_path(self) -> Similarity:
+        """From the world of the map's path to the metric world."""
+        return self.state.metric_from_model @ self.posed.model_from_path
+
+    @property
     def world_from_cam(self) -> Array:
         """(n, 3, 3) rotations of the cameras into the metric world."""
         turned: Array = self.state.metric_from_model.rotation @ self.posed.model_from_cam
@@ -141,9 +147,9 @@ class RangesOnMap:
 
     @property
     def by_poses(self) -> csr_array:
-        """(n, 6 k) derivatives by the path's k poses: turns in their own frames, shifts in the model's world."""
-        placed, arms_m = self.state.metric_from_model, self.problem.tag_from_center
-        return by_poses(self.gradient, placed, self.posed.model_from_cam, arms_m, self.posed.on_path)
+        """(n, 6 k) derivatives by the path's k poses: turns in their own frames, shifts in the path's world."""
+        arms_m = self.problem.tag_from_center @ self.state.metric_from_model.rotation.T
+        return by_poses(self.gradient, self.metric_from_path, self.world_from_cam, arms_m, self.posed.on_path)
 
     def bins(self, weights: Array, noise_of_anchor: Array, max_num: int) -> RangeBins:
         """Average the ranges, as ``range_bins``."""

@@ -21,8 +21,8 @@ from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_stee
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
-from rangesfm.util.geometry.similarity import path_shape, rounding_of
-from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory
+from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
+from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory, first_camera_from
 
 if TYPE_CHECKING:
     from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
@@ -40,6 +40,7 @@ class ScaleProblem:
     Attributes:
         given: the ranges on the path.
         ranges: the problem; its model world is the first camera's frame, unscaled.
+        model_from_path: from the world of the map's path to that.
         model_from_cam: (k, 3, 3) rotations of the keyframe nearest to each range.
         velocity: (k, 3) camera velocity at each range, model units per second. None without times, or if the photos'
             times do not increase along the path.
@@ -50,6 +51,7 @@ class ScaleProblem:
 
     given: RangesOnPath
     ranges: RangeProblem
+    model_from_path: Similarity
     model_from_cam: Array
     velocity: Array | None
     rows: Indices
@@ -89,7 +91,10 @@ class ScaleProblem:
         return self.observations.placing_stddev_m(metres_per_unit)[self.rows]
 
     def carried(self, turns: Array, shifts: Array) -> ScaleProblem:
-        """Return them on the path bent by turns (k, 3, 3) and shifts (k, 3) of its keyframes, in the model's world."""
+        """Return them on the path bent by turns (k, 3, 3) and shifts (k, 3) of its keyframes, in its own world."""
+        to_model = self.model_from_path
+        turns = to_model.rotation @ turns @ to_model.rotation.T
+        shifts = to_model.scale * shifts @ to_model.rotation.T
         at, share = self.on_path, self.on_path.fraction[:, None]
         turn = turns[at.nearest]
         ranges = replace(
@@ -136,7 +141,7 @@ def scale_problem(
         GeometryError: too few ranges have a place on the path.
     """
     observations, anchor_frame, range_model = given.observations, given.anchor_frame, given.range_model
-    log = observations.log
+    log, path = observations.log, given.bending.path
     in_log = _anchors_of_log(log.anchor_ids, given.anchors)
     surveyed = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
     rows, heard = _usable_ranges(observations, surveyed)
@@ -159,8 +164,8 @@ def scale_problem(
     has_ends = np.append(heard | placed, True)[distances.anchor_pair].all(axis=1)  # the last is for points, of index -1
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
-        centers=_centers_in_first_camera(observations.centers[rows], given.trajectory),
-        tag_from_center=observations.tag_from_center[rows] @ given.trajectory.world_from_cam[0],
+        centers=_centers_in_first_camera(observations.centers[rows], path),
+        tag_from_center=observations.tag_from_center[rows] @ path.world_from_cam[0],
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=errors.stddev_m,
@@ -177,8 +182,8 @@ def scale_problem(
         gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,
     )
-    turns, velocity = turns_and_velocities(observations, rows, given.trajectory)
-    return ScaleProblem(given, ranges, turns, velocity, rows, tuple(notes), left_out)
+    turns, velocity = turns_and_velocities(observations, rows, path)
+    return ScaleProblem(given, ranges, first_camera_from(path), turns, velocity, rows, tuple(notes), left_out)
 
 
 def turns_and_velocities(
