@@ -91,7 +91,7 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 _TimeUnit = Literal["s", "ms", "us", "ns", "ticks", "min", "h", "d", "iso", "dmy", "mdy"]
-_LengthUnit = Literal["m", "cm", "mm", "ft"]
+_LengthUnit = Literal["m", "cm", "mm", "dm", "km", "ft", "in", "yd"]
 
 
 class ImageOptions(Options, table="images"):

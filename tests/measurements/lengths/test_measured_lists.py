@@ -70,6 +70,40 @@ def test_how_another_tape_was_read_is_said(tmp_path: Path) -> None:
     assert second == "d.csv: numbers have decimal commas"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from;to;distance [mm]\nA1;A2;2.832\nA1;A3;850\n",  # 850 would have decimals, too
+        "from;to;distance [mm];stddev [mm]\nA1;A2;2.832;2,5\nA1;A3;0850;3,5\n",  # commas are the decimal ones
+        "from;to;distance [mm]\nA1;A2;2.832,0\nA1;A3;850,0\n",
+        'from,to,distance_mm\nA1,A2,"2,832"\nA1,A3,850\n',
+        "from,to,distance\nA1,A2,2.832 m\nA1,A3,85 cm\n",
+        "from,to,distance_in\nA1,A2,111.4960630\nA1,A3,33.4645669\n",
+        "von;nach;Länge in m\nA1;A2;2.832\nA1;A3;0.850\n",
+    ],
+)
+def test_thousands_and_units_are_seen_by_other_numbers_and_by_the_unit(text: str, tmp_path: Path) -> None:
+    lengths = [one.distance_m for one in read_tape(write(tmp_path / "d.csv", text)).distances]
+    np.testing.assert_allclose(lengths, [2.832, 0.85], rtol=1e-9)
+
+
+def test_a_number_of_millimetres_that_may_be_thousands_is_asked_about(tmp_path: Path) -> None:
+    path = write(tmp_path / "d.csv", "from,to,distance_mm\nA1,A2,2.832\nA1,A3,12.400\n")
+    with pytest.raises(InputError) as error:
+        read_tape(path)
+    assert str(error.value).endswith(
+        "distance_mm is 2.832, which may be 2832 mm or less than 0.05 m: write it as 2832 or 2.8320"
+    )
+    path = write(tmp_path / "d.csv", "from,to,distance_mm\nA1,A2,2832\nA1,A3,12400\n")
+    assert [one.distance_m for one in read_tape(path).distances] == [2.832, 12.4]
+    path = write(tmp_path / "d.csv", "from,to,distance_mm,stddev_mm\nA1,A2,112.832,1.250\n")
+    (length,) = read_tape(path).distances
+    np.testing.assert_allclose([length.distance_m, length.stddev_m], [0.112832, 0.00125])
+    assert (
+        "d.csv: numbers of distance_mm such as 112.832 have decimals, not thousands set apart" in read_tape(path).notes
+    )
+
+
 def test_points_with_the_usual_names_may_have_decimal_commas(tmp_path: Path) -> None:
     path = write(tmp_path / "p.csv", "marker;x_m;y_m;z_m;stddev_m;kind\nP1;1,5;2;3;0,01;check\nP2;4;5,25;6;0,02;\n")
     points = read_control_points(PointOptions(path=path))

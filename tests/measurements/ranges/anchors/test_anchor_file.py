@@ -206,10 +206,19 @@ def test_lengths_are_in_their_own_unit_or_else_in_that_of_the_coordinates(
     assert anchor.range_bias_stddev_m == pytest.approx(6 / (100 if "cm" in f"{header} {unit}" else 1))
 
 
-def test_all_units_of_the_coordinates_are_told_but_metres(tmp_path: Path) -> None:
+def test_the_unit_of_each_coordinate_is_told(tmp_path: Path) -> None:
     found = read_anchor_list(table(tmp_path, "Point,X [mm],Y [cm],Z [m]/A,1000,200,3"))
     np.testing.assert_allclose(known(found[0][0].position_m), [1, 2, 3])
-    assert found[1][-1] == "points.csv: coordinates are in cm and mm"
+    assert found[1][-1] == "points.csv: coordinates: x in mm, y in cm, z in m"
+    assert read_anchor_list(table(tmp_path, "Point,X m,Y m,Z mm/A,1,2,3"))[1][-1].endswith("x in m, y in m, z in mm")
+
+
+def test_points_between_thousands_are_no_decimal_ones(tmp_path: Path) -> None:
+    rows = ["A;0;1.200;500", "B;5.200;0;2.832", "C;1.105.200;4.100;950,5"]
+    anchors, notes = read_anchor_list(table(tmp_path, "/".join(["Anker;X [mm];Y [mm];Z [mm]", *rows])))
+    places = [known(anchor.position_m) for anchor in anchors]
+    np.testing.assert_allclose(places, [[0, 1.2, 0.5], [5.2, 0, 2.832], [1105.2, 4.1, 0.9505]])
+    assert "points.csv: numbers of Y [mm] have their thousands set apart: 1.200 is 1200" in notes
 
 
 def test_files_without_a_table_of_anchors_and_columns_that_miss_some_are_refused(tmp_path: Path) -> None:

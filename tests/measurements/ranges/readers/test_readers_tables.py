@@ -213,6 +213,45 @@ def test_column_an_anchor_is_understood(tmp_path: Path, kind: str) -> None:
     assert log.tag_ids == ("tag",)
 
 
+@pytest.mark.parametrize(
+    ("name", "per_metre"),
+    [
+        *(("range_in", 1 / 0.0254), ("dist (inch)", 1 / 0.0254), ("Abstand [Zoll]", 1 / 0.0254), ("d_ft", 1 / 0.3048)),
+        *(("distance_yd", 1 / 0.9144), ("range_dm", 10), ("distance in m", 1), ("range_km", 1e-3)),
+    ],
+)
+def test_each_unit_that_a_column_names_is_read(tmp_path: Path, name: str, per_metre: float) -> None:
+    content = lines(f"time_s,anchor_id,{name}", lambda t, a, r: f"{t:.3f},{a},{r * per_metre:.6f}")
+    np.testing.assert_allclose(read_ranges(write(tmp_path, content)).range_m, [r for *_, r in ROWS], atol=1e-3)
+
+
+def test_ranges_in_units_of_their_own_are_in_metres(tmp_path: Path) -> None:
+    each = {"A0": (1, "m"), "A1": (100, "cm"), "A2": (1000, "mm"), "A3": (1, "m")}
+    header = "time_s," + ",".join(f"range_{anchor}_{unit}" for anchor, (_, unit) in each.items())
+    factors = [factor for factor, _ in each.values()]
+    rounds = [
+        "{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format(one[0][0], *(r * f for (*_, r), f in zip(one, factors)))
+        for one in (ROWS[k : k + 4] for k in range(0, len(ROWS), 4))
+    ]
+    log = read_ranges(write(tmp_path, "\n".join([header, *rounds]) + "\n"))
+    np.testing.assert_allclose(log.range_m, [r for *_, r in ROWS], atol=1e-3)
+    cells = lines("time_s,anchor_id,range", lambda t, a, r: f"{t:.3f},{a},{r * each[a][0]:.4f} {each[a][1]}")
+    log = read_ranges(write(tmp_path, cells))
+    np.testing.assert_allclose(log.range_m, [r for *_, r in ROWS], atol=1e-3)
+    assert "numbers of range have units of their own (cm, m, mm)" in log.notes
+    with pytest.raises(InputError, match="range_A3 has no unit, and other columns of ranges are in m, cm, mm"):
+        read_ranges(write(tmp_path, "\n".join([header.replace("A3_m", "A3"), *rounds]) + "\n"))
+
+
+@pytest.mark.parametrize("times", [100, 1000])
+def test_ranges_that_change_their_unit_are_refused_with_a_line_of_each(tmp_path: Path, times: int) -> None:
+    content = lines("timestamp_s,anchor_id,range_m", lambda t, a, r: f"{t:.3f},{a},{r * (times if t > 20 else 1):.4f}")
+    with pytest.raises(InputError) as error:
+        read_ranges(write(tmp_path, content))
+    assert f"uwb.csv:163: the range is {times * ROWS[161][2]:g} m here and {ROWS[0][2]:.4g}" in str(error.value)
+    assert f"79 of 240 ranges are {times} times as long as the others, as in " in str(error.value)
+
+
 def test_lists_in_messages_of_rostopic_are_a_row_each(tmp_path: Path) -> None:
     content = "".join(
         f"header:\n  stamp:\n    sec: {1700000000 + k}\n    nanosec: 5\n  frame_id: uwb\nranges:\n"

@@ -29,7 +29,6 @@ from rangesfm.measurements.ranges.readers.lists import (
     unclear_table,
 )
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
-from rangesfm.measurements.ranges.readers.units import named_length_unit
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable, repeated, write_user_table
@@ -70,7 +69,7 @@ def read_anchor_list(
         path: the file.
         columns: name of the column of each quantity (QUANTITIES), or its number in a table without names;
             without any they are recognized.
-        unit: unit of the coordinates, "m", "cm", "mm" or "ft"; None: that in the names of the columns, else metres.
+        unit: unit of the coordinates, one of UNITS_PER_METRE; None: that in the names of the columns, else metres.
 
     Returns:
         The anchors in the order of the file, and lines for the user about how the file was read.
@@ -270,7 +269,7 @@ def _doubts_about_axes(
             form.choice(f"if {x} is east and {y} is north", columns),
         ]
         yield f"{y} comes before {x}, as where surveyors call north x", choices
-    units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
+    units = {axis: terms.named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
     if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})
         choices = [form.choice(f"if all are in {unit}", columns, unit=unit) for unit in told]

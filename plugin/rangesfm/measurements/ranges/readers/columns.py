@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import Final
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Categories
+from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.measurements.ranges.readers.counters import continued
 from rangesfm.measurements.ranges.readers.layout import MISSING
@@ -32,10 +34,12 @@ from rangesfm.measurements.ranges.readers.units import (
     Ask,
     days_before_1970,
     range_unit,
+    refuse_two_units,
     time_unit,
     units_within_reach,
     which_unit,
 )
+from rangesfm.measurements.ranges.readers.vocabulary import named_length_unit
 from rangesfm.measurements.ranges.twr import StampOptions, double_sided_range, single_sided_range
 from rangesfm.options import TIME_S, RangesOptions
 from rangesfm.util.files.text_tables import TextTable
@@ -85,6 +89,8 @@ def read_columns(
     else:
         image_name = table.text("image_name")
     row = np.repeat(np.arange(len(table)), max(1, len(wide)))
+    if options.range_unit is None and len(units := _named_units(table, [*wide])) > 1:
+        table, options = _in_metres(table, units), options.changed(range_unit="m")
     ranges = _ranges(table, [*wide] or ["range"], options)
     link = anchor.index * len(tag.names) + tag.index
     measured, of_codes = which_are_measured(ranges, link, path)
@@ -99,6 +105,7 @@ def read_columns(
         others = [Choice("", {**mapped, "range_unit": other}) for other in units_within_reach(ranges[measured], unit)]
     per_metre = UNITS_PER_METRE[unit]
     ranges_m = ranges / per_metre
+    refuse_two_units(ranges_m[measured], link[measured], table.line[row[measured]], path)
     measured[measured], of_far = which_are_within_reach(ranges_m[measured], path, others)
     notes += of_far
     row, anchor, tag = row[measured], anchor.subset(measured), tag.subset(measured)
@@ -175,6 +182,32 @@ def _ranges(table: TextTable, columns: Sequence[str], options: RangesOptions) ->
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
     expected = f"a positive number{unit}; 0 means no measurement"
     return np.column_stack([table.numbers(k, empty=0.0, missing=MISSING, expected=expected) for k in columns]).ravel()
+
+
+def _named_units(table: TextTable, wide: Sequence[str]) -> dict[str, list[str]]:
+    """Return the columns of ranges by the unit in their names, "" for none."""
+    units: dict[str, list[str]] = {}
+    for column in wide:
+        units.setdefault(named_length_unit(table.heading(column)) or "", []).append(column)
+    return units
+
+
+def _in_metres(table: TextTable, units: Mapping[str, Sequence[str]]) -> TextTable:
+    """Return a table with its ranges in metres, given the columns of these by unit.
+
+    Raises:
+        InputError: a column has no unit.
+    """
+    if bare := units.get(""):
+        others = ", ".join(unit for unit in units if unit)
+        message = f"{table.names[bare[0]]} has no unit, and other columns of ranges are in {others}: give each its unit"
+        raise InputError(message, table.path)
+    cells = dict(table.cells)
+    for unit, columns in units.items():
+        for column in columns:
+            values = table.numbers(column, empty=0.0, missing=MISSING) / UNITS_PER_METRE[unit]
+            cells[column] = [f"{value:.12g}" for value in values.tolist()]
+    return replace(table, cells=cells)
 
 
 def _ranges_by_stamps(table: TextTable, options: StampOptions) -> Array:

@@ -224,7 +224,7 @@ def _is_angle(column: ColumnSample) -> bool:
 
 
 def _groups(columns: Sequence[ColumnSample]) -> list[list[tuple[ColumnSample, list[int]]]]:
-    """Return groups of columns whose names differ in ids only, with the indices of these words in each name."""
+    """Return groups of columns whose names differ in ids and units only, with the indices of the ids in each name."""
     groups: dict[tuple[str, ...], list[tuple[ColumnSample, list[int]]]] = defaultdict(list)
     for column in columns:
         ids = [
@@ -235,7 +235,8 @@ def _groups(columns: Sequence[ColumnSample]) -> list[list[tuple[ColumnSample, li
             or (len(word) == 4 and word.upper() in column.name)
         ]
         if ids:
-            alike = tuple("#" if k in ids else word for k, word in enumerate(column.words))
+            named = [*enumerate(column.words)]
+            alike = tuple("#" if k in ids else word for k, word in named if word not in terms.LENGTH_UNIT)
             groups[alike].append((column, ids))
     return [group for group in groups.values() if len(group) > 1]
 

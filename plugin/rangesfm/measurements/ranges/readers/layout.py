@@ -23,7 +23,18 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
-from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
+from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
+from rangesfm.measurements.ranges.readers.vocabulary import (
+    ANCHOR,
+    BIAS,
+    ID,
+    LENGTHS,
+    POINT,
+    STDDEV,
+    TIMES,
+    named_length_unit,
+    words_of,
+)
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS
 from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, num_cells, read_head, read_text
 
@@ -59,12 +70,19 @@ _MAX_NUM_WORDS = 20  # lines of text before the table
 _MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
-# Numbers whose thousands are set apart: 2,600,000.5, 2.600.000,5, and 2'600'000.5 or with blanks.
+# Numbers whose thousands are set apart: 2,600,000.5, 2.600.000 or 2.600,5, and 2'600'000.5 or with blanks.
 _THOUSANDS = {
     ",": re.compile(r"[-+]?\d{1,3}(?:,\d{3})+\.\d+", re.ASCII),
-    ".": re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+", re.ASCII),
+    ".": re.compile(r"[-+]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:\.\d{3}){2,})", re.ASCII),
     "'\u2019 \xa0\u202f": re.compile(r"[-+]?\d{1,3}(?:['\u2019 \xa0\u202f]\d{3})+(?:[.,]\d+)?", re.ASCII),
 }
+# Numbers that may be thousands or decimals, by their only mark: 2.832.
+_THOUSANDS_OR_DECIMALS = {mark: re.compile(rf"[-+]?[1-9]\d{{0,2}}[{mark}]\d{{3}}", re.ASCII) for mark in ".,"}
+_FINE_UNITS = ("mm", "cm")  # units of which nobody measures thousandths
+SHORTEST_M = 0.05
+"""Lengths of a site that are all shorter than this, metres, may be something else."""
+# Words in the names of columns of numbers below a thousand, and of ids.
+_BELOW_THOUSAND = STDDEV | BIAS | ANCHOR | POINT | ID | {"error", "err"}
 _GROUPED = re.compile(r"[-+]?\d[\d,.'\u2019 \xa0\u202f]*", re.ASCII)
 # Exiftool prints heights as 415.2 m Above Sea Level.
 _WITH_UNIT = re.compile(rf"({_DECIMAL_COMMA.pattern}|{_NUMBER.pattern}) ?([A-Za-z]+)(?: Above Sea Level)?", re.ASCII)
@@ -88,7 +106,10 @@ class ColumnSample:
         unit: unit after each of its numbers in the file, "" if there is none.
         thousands: characters that set thousands apart there, "" if there are none.
         has_commas: whether numbers have decimal commas there.
-        spelling: what the cells are in another form there: "dates", "angles" in degrees, minutes and seconds, or "".
+        spelling: what the cells are in another form there: "dates", "angles" in degrees, minutes and seconds,
+            "lengths" with units of their own, which are in metres here, or "".
+        note: line for the user about how its numbers were read; "" if they say it.
+        thousands_are_open: whether its numbers may have their thousands set apart there, or decimals.
     """
 
     name: str
@@ -97,6 +118,8 @@ class ColumnSample:
     thousands: str = ""
     has_commas: bool = False
     spelling: str = ""
+    note: str = ""
+    thousands_are_open: bool = False
 
     @cached_property
     def words(self) -> list[str]:
@@ -156,26 +179,82 @@ class ColumnSample:
         if self.spelling == "angles":
             return cell if (angle := _spelt_angle(cell)) is None else f"{angle:.12g}"
         found = _WITH_UNIT.fullmatch(cell) if self.unit else None
-        number = found[1] if found and found[2] == self.unit else cell
+        own = found[2].lower() if found and self.spelling == "lengths" else ""
+        number = found[1] if found and (found[2] == self.unit or own in LENGTHS) else cell
         if self.thousands and _GROUPED.fullmatch(number):
             number = re.sub(f"[{re.escape(self.thousands)}]", "", number).replace(",", ".")
-        return number.replace(",", ".") if self.has_commas and _DECIMAL_COMMA.fullmatch(number) else number
+        if self.has_commas and _DECIMAL_COMMA.fullmatch(number):
+            number = number.replace(",", ".")
+        is_length = own in LENGTHS and _NUMBER.fullmatch(number)
+        return f"{float(number) / UNITS_PER_METRE[LENGTHS[own]]:.12g}" if is_length else number
 
-    def in_usual_form(self) -> ColumnSample:
-        """Return the column with the form of its cells found out, and these in the usual form."""
+    def in_usual_form(self, mark_of_thousands: str = "") -> ColumnSample:
+        """Return the column with the form of its cells found out, and these in the usual form.
+
+        Args:
+            mark_of_thousands: that sets thousands apart in other columns of the table, if it is known.
+        """
         if self.filled and all(map(spelt_date, self.filled)):
-            column = replace(self, spelling="dates")
-        elif self.filled and not any(_spelt_angle(cell) is None for cell in self.filled):
-            column = replace(self, spelling="angles")
-        else:
-            units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
-            unit = next(iter(units)) if len(units) == 1 else ""
-            column = replace(self, unit=unit if unit.lower() in _UNITS else "")
-            cells = [*map(column.usual, self.filled)]
-            apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
-            has_commas = any(map(_DECIMAL_COMMA.fullmatch, cells))
-            column = replace(column, thousands=next(apart, ""), has_commas=has_commas)
-        return self if column.is_usual else replace(column, cells=tuple(map(column.usual, self.cells)))
+            return replace(self, spelling="dates").with_usual_cells()
+        if self.filled and not any(_spelt_angle(cell) is None for cell in self.filled):
+            return replace(self, spelling="angles").with_usual_cells()
+        matches = [_WITH_UNIT.fullmatch(cell) for cell in self.filled]
+        units = {match[2] if match else "" for match in matches}
+        are_lengths = len(units) > 1 and all(unit.lower() in LENGTHS for unit in units)
+        unit = "m" if are_lengths else next(iter(units)) if len(units) == 1 else ""
+        column = replace(self, unit=unit if unit.lower() in _UNITS else "", spelling="lengths" * are_lengths)
+        cells = [match[1] if match and column.unit else cell for match, cell in zip(matches, self.filled)]
+        column = replace(
+            column,
+            thousands=next((marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells))), ""),
+            has_commas=any(map(_DECIMAL_COMMA.fullmatch, cells)),
+        )
+        if are_lengths:
+            column = replace(
+                column, note=f"numbers of {self.name} have units of their own ({', '.join(sorted(units))})"
+            )
+        if column.thousands or column.spelling or not _BELOW_THOUSAND.isdisjoint(column.words):
+            return column.with_usual_cells()
+        if mark_of_thousands and _may_be_thousands(cells, mark_of_thousands):
+            number = next(cell for cell in cells if mark_of_thousands in cell)
+            return column.with_thousands(mark_of_thousands, number).with_usual_cells()
+        return column._with_thousands_by_unit(cells).with_usual_cells()
+
+    def _with_thousands_by_unit(self, cells: Sequence[str]) -> ColumnSample:
+        """Return the column with what its unit tells of thousands: nobody measures 2.832 mm.
+
+        Args:
+            cells: without the unit.
+        """
+        unit = named_length_unit(f"{self.name} {self.unit}")
+        mark = "," if self.has_commas else "."
+        if unit not in _FINE_UNITS or not _may_be_thousands(cells, mark):
+            return self
+        numbers = [cell for cell in cells if mark in cell]
+        if any(cell.isdigit() and int(cell) > 0 for cell in cells):  # whole ones would have the same decimals
+            return self.with_thousands(mark, numbers[0])
+        longest = max(abs(float(number.replace(mark, "."))) for number in numbers)
+        if longest < SHORTEST_M * UNITS_PER_METRE[unit]:
+            return replace(self, thousands_are_open=True)
+        return replace(self, note=f"numbers of {self.name} such as {numbers[0]} have decimals, not thousands set apart")
+
+    def with_thousands(self, mark: str, number: str) -> ColumnSample:
+        """Return the column with thousands that a mark sets apart, as in one of its numbers, and a note about it."""
+        note = f"numbers of {self.name} have their thousands set apart: {number} is {number.replace(mark, '')}"
+        return replace(self, thousands=mark, has_commas=self.has_commas and mark != ",", note=note)
+
+    def shows_mark_of_thousands(self, cells: Sequence[str]) -> str:
+        """Return the mark that sets thousands apart in the whole table, by these cells in the file; "" if none says it.
+
+        Of numbers with decimal commas, one such as 2,5 says it.
+        """
+        if self.has_commas:
+            return "" if _may_be_thousands(cells, ",") else "."
+        return self.thousands if self.thousands in (".", ",") else ""
+
+    def with_usual_cells(self) -> ColumnSample:
+        """Return the column, in whose form the cells are, with these in the usual form."""
+        return self if self.is_usual else replace(self, cells=tuple(map(self.usual, self.cells)))
 
     def __str__(self) -> str:
         if self.kind == "numbers" and len(self.numbers):
@@ -184,6 +263,12 @@ class ColumnSample:
             return f"{self.name} (nothing)"
         shown = next((cell for cell in self.filled if not _NUMBER.fullmatch(cell)), self.filled[0])
         return f"{self.name} ({self.kind}, {shown!r})"
+
+
+def _may_be_thousands(cells: Sequence[str], mark: str) -> bool:
+    """Return whether all numbers with a decimal mark among cells may have it before their last three digits instead."""
+    pattern = _THOUSANDS_OR_DECIMALS[mark]
+    return any(mark in cell for cell in cells) and all(mark not in cell or pattern.fullmatch(cell) for cell in cells)
 
 
 @dataclass(frozen=True)
@@ -222,7 +307,11 @@ class Layout:
             cells={**table.cells, **{one.name: [*map(one.usual, table.text(one.name, empty=""))] for one in unusual}},
             units={column.name: column.unit for column in self.columns},
             missing=MISSING,
-            notes=(*table.notes, *["numbers have decimal commas"] * any(one.has_commas for one in unusual)),
+            notes=(
+                *table.notes,
+                *["numbers have decimal commas"] * any(one.has_commas for one in unusual),
+                *(column.note for column in self.columns if column.note),
+            ),
         )
 
 
@@ -273,13 +362,14 @@ def find_layout(path: Path, separator: str = "") -> Layout | None:
     if not body:
         return None
     header = tuple(_unique(names or [str(k + 1) for k in range(num)], num))
-    columns = (ColumnSample(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
+    samples = [ColumnSample(name, tuple(row[k] for row in body)) for k, name in enumerate(header)]
+    columns = [one if separator == "," and "," in "".join(one.cells) else one.in_usual_form() for one in samples]
+    marks = {mark for one, sample in zip(columns, samples) if (mark := one.shows_mark_of_thousands(sample.filled))}
+    if len(marks) == 1:
+        columns = [one if one is sample else sample.in_usual_form(*marks) for one, sample in zip(columns, samples)]
     header_row = rows[first] if num_skipped >= content[first][0] else ()
     return Layout(
-        tuple(
-            column if separator == "," and "," in "".join(column.cells) else column.in_usual_form()
-            for column in columns
-        ),
+        tuple(columns),
         names is not None,
         lambda every_row: read_rows(path, header, separator, num_skipped, header_row, every_row=every_row),
     )

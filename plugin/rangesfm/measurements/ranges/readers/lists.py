@@ -6,7 +6,8 @@ row of a list counts: a line that is not a row of the table is an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -18,9 +19,9 @@ from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import SHORTEST_M, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError, columns_typed
-from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE, named_length_unit
+from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.text_tables import (
     FOUND,
@@ -156,16 +157,19 @@ class TableForm:
         if taken is None:
             found = printable(", ".join(layout.names))
             raise InputError(f"no columns of {self.what}; found {found}; {self.expected}", path)
+        _require_clear_numbers(layout, taken.values(), path)
         table = layout.read(every_row=every_row)
         # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
         left = [
             column.in_usual_form() for column in layout.columns if column.name in taken.values() and column.is_usual
         ]
-        cells = {one.name: [*map(one.usual, table.text(one.name, empty=""))] for one in left if not one.is_usual}
+        left = [column for column in left if not column.is_usual]
+        cells = {one.name: [*map(one.usual, table.text(one.name, empty=""))] for one in left}
         unused = printable(", ".join(name for name in layout.names if name not in taken.values()))
         notes = (
             columns_taken(taken, layout.has_names or bool(columns)) + f"; not used: {unused}" * bool(unused),
             *table.notes,
+            *(column.note for column in left if column.note),
         )
         table = replace(table, cells={**table.cells, **cells}, notes=notes).by_quantity(taken)
         return self._with_lengths(table, unit)
@@ -191,14 +195,26 @@ class TableForm:
     def _with_lengths(self, table: TextTable, unit: str | None) -> TextTable:
         """Return the table with the unit of each length."""
         lengths = [quantity for quantity, name in self.names.items() if name.endswith("_m") and quantity in table]
-        named = {quantity: named_length_unit(table.heading(quantity)) for quantity in lengths}
+        named = {quantity: terms.named_length_unit(table.heading(quantity)) for quantity in lengths}
         first = [quantity for quantity in self.required if quantity in lengths]
         units = {quantity: unit or named[quantity] or "m" for quantity in first}
-        others = sorted({*units.values()} - {"m"})
         what = "distances" if "distance" in units else "coordinates"
-        note = [f"{what} are in {' and '.join(others)}"] if others else []
+        if len({*units.values()}) > 1:
+            note = [f"{what}: {', '.join(f'{quantity} in {own}' for quantity, own in units.items())}"]
+        else:
+            note = [f"{what} are in {own}" for own in {*units.values()} - {"m"}]
         units = {quantity: units.get(quantity) or own or units[first[0]] for quantity, own in named.items()}
         return replace(table, units={**table.units, **units}, notes=(*table.notes, *note))
+
+
+def _require_clear_numbers(layout: Layout, names: Collection[str], path: Path) -> None:
+    """Raise InputError if numbers of columns may have their thousands set apart, or decimals."""
+    for column in layout.columns:
+        if column.name in names and column.thousands_are_open:
+            number = next(cell for cell in column.filled if re.search("[.,]", cell))
+            whole, unit = re.sub("[.,]", "", number), terms.named_length_unit(f"{column.name} {column.unit}")
+            message = f"{column.name} is {number}, which may be {whole} {unit} or less than {SHORTEST_M:g} m"
+            raise InputError(f"{message}: write it as {whole} or {number}0", path)
 
 
 def columns_taken(columns: Mapping[str, str], are_named: bool) -> str:

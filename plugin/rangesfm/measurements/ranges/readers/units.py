@@ -7,16 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.measured import REACH_M
 from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
-from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
+from rangesfm.measurements.ranges.readers.vocabulary import TIMES, named_length_unit, named_unit, words_of
 from rangesfm.util.files.clock_times import are_seconds_since_1970
 
 FOOT_M = 0.3048
-UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / FOOT_M}
+UNITS_PER_METRE = {
+    "m": 1.0,
+    "cm": 100.0,
+    "mm": 1000.0,
+    "dm": 10.0,
+    "km": 1e-3,
+    "ft": 1 / FOOT_M,
+    "in": 12 / FOOT_M,
+    "yd": 1 / (3 * FOOT_M),
+}
 
 _MIN_NUM = 20  # number of values below which the values do not show their unit
 # Smallest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller step means
@@ -38,6 +47,10 @@ _NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
 # without the name of a unit usually mean metres.
 _MOST, _FARTHEST = 80.0, 100.0
 _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
+# Ranges of one pair of nodes are in two units if there are at least so many of each, with such a gap between them, ...
+_MIN_NUM_IN_UNIT, _GAP = 3, 3.0
+# ... such a share of the longer ones would be among the shorter or near them, and they are such a share of all ranges.
+_MIN_SHARE_INSIDE, _WIDENED, _MIN_SHARE_IN_UNIT = 0.95, 1.5, 0.05
 # Largest share of ranges that differ from the one before by more than noise and motion allow.
 _MAX_SHARE_OF_JUMPS = 0.25
 
@@ -67,7 +80,7 @@ def time_unit(name: str, times: Array, notes: list[str], ask: Ask, slowest_s: fl
     Raises:
         InputError: the unit is ambiguous.
     """
-    named, distinct = _named(name, TIMES), np.unique(times)
+    named, distinct = named_unit(words_of(name), TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
     is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= slowest_s
@@ -137,6 +150,39 @@ def units_within_reach(ranges: Array, unit: str) -> list[str]:
     return [other for other in ("cm", "mm", "ft") if other != unit and middle / UNITS_PER_METRE[other] <= REACH_M]
 
 
+def refuse_two_units(ranges_m: Array, pair: Indices, line: Indices, path: Path) -> None:
+    """Refuse a log whose ranges are in metres in some lines and in centimetres or millimetres in others.
+
+    Then those of one pair of nodes have a wide gap between them, and all above it are as many times too long.
+
+    Args:
+        ranges_m: (n,) as they were read. pair: (n,) number of each range's pair of nodes. line: (n,) in the file.
+
+    Raises:
+        InputError: at least a twentieth of the ranges are in another unit than the others; it names a line of each.
+    """
+    for times, smaller in ((100.0, "cm"), (1000.0, "mm")):
+        is_other = np.zeros(len(ranges_m), bool)
+        for rows in rows_by_key(pair):
+            ordered = np.sort(ranges_m[rows])
+            gap = int(np.argmax(ordered[1:] / ordered[:-1])) if len(ordered) > 1 else 0
+            low, high = ordered[: gap + 1], ordered[gap + 1 :]
+            if min(len(low), len(high)) < _MIN_NUM_IN_UNIT or high[0] < _GAP * low[-1]:
+                continue
+            are_inside = (high / times >= low[0] / _WIDENED) & (high / times <= low[-1] * _WIDENED)
+            if np.mean(are_inside) >= _MIN_SHARE_INSIDE:
+                is_other[rows] = ranges_m[rows] > low[-1]
+        if np.mean(is_other) >= _MIN_SHARE_IN_UNIT:
+            first, other = int(np.argmax(is_other)), int(np.argmin(is_other))
+            raise InputError(
+                f"the range is {ranges_m[first]:g} m here and {ranges_m[other]:g} m in line {line[other]}, and "
+                f"{np.count_nonzero(is_other)} of {len(ranges_m)} ranges are {times:g} times as long as the others, as "
+                f"in {smaller}: write all in one unit",
+                path,
+                int(line[first]),
+            )
+
+
 def _share_of_jumps(ranges_m: Array, times: Array, pair: Indices, unit: str) -> float:
     """Return the share of ranges that differ from their pair's previous one by more than noise and motion allow.
 
@@ -149,13 +195,3 @@ def _share_of_jumps(ranges_m: Array, times: Array, pair: Indices, unit: str) -> 
     same = np.diff(pair[order]) == 0
     moved, seconds = np.abs(np.diff(ranges_m[order]))[same], np.diff(times[order])[same]
     return float(np.mean(moved > noise_m + _FASTEST_M_PER_S * seconds)) if len(moved) else 0.0
-
-
-def named_length_unit(name: str) -> str | None:
-    """Return the unit of length in the words of a name, or None."""
-    return _named(name, LENGTHS)
-
-
-def _named(name: str, units: dict[str, str]) -> str | None:
-    """Return the unit in the words of a name, the last one if there are several, or None."""
-    return next((units[word] for word in reversed(words_of(name)) if word in units), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 
 
 def _unit_by_word(words_by_unit: dict[str, str]) -> dict[str, str]:
@@ -25,7 +26,11 @@ LENGTHS = _unit_by_word(
         "m": "m meter meters metre metres",
         "cm": "cm centimeter centimeters centimetre centimetres",
         "mm": "mm millimeter millimeters millimetre millimetres",
-        "ft": "ft foot feet",
+        "dm": "dm decimeter decimeters decimetre decimetres dezimeter",
+        "km": "km kilometer kilometers kilometre kilometres",
+        "ft": "ft foot feet fuß",
+        "in": "in inch inches zoll pouce pouces pulgada pulgadas pollice pollici",
+        "yd": "yd yard yards",
     }
 )
 """Units of lengths, by the words for them."""
@@ -42,6 +47,18 @@ def words_of(name: str) -> list[str]:
         pattern = r"\d+|[^\W\d][^\W\dA-Z]*|[A-Z]+"
         words += [part] if is_id else re.findall(rf"[A-Z]{{2,}}(?![^\W\dA-Z])|{pattern}", part)
     return [word.lower() for word in words]
+
+
+def named_length_unit(name: str) -> str | None:
+    """Return the unit of length in the words of a name, or None."""
+    words = words_of(name)
+    # "distance in m": anywhere but at the end, "in" is no inch.
+    return named_unit([*(word for word in words[:-1] if word != "in"), *words[-1:]], LENGTHS)
+
+
+def named_unit(words: Sequence[str], units: Mapping[str, str]) -> str | None:
+    """Return the unit in the words of a name, the last one if there are several, or None."""
+    return next((units[word] for word in reversed(words) if word in units), None)
 
 
 Words = frozenset[str]
