@@ -136,14 +136,14 @@ class EstimatedMistake:
         """Return how much of the mistake the other observations check, 0 to 1, in the worst direction.
 
         It is the share of its information in the observations that the unknowns leave (Baarda's redundancy number, for
-        several numbers).
+        several numbers). A mistake of which the observations of a known map show nothing is not checked by any.
 
         Args:
             seen: (c, k) its whitened effect on the observations of a map that is known.
         """
-        if not self.is_seen:
+        if not self.is_seen or not seen.any():
             return 0.0
-        return float(np.clip(np.linalg.norm(seen @ self.root, 2) ** -2, 0.0, 1.0))
+        return float(1 / max(np.linalg.norm(seen @ self.root, 2), 1.0) ** 2)
 
 
 class Solved:
