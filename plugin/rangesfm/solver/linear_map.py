@@ -143,7 +143,7 @@ class EstimatedMistake:
         """
         if not self.is_seen or not seen.any():
             return 0.0
-        return float(1 / max(np.linalg.norm(seen @ self.root, 2), 1.0) ** 2)
+        return 1 / max(float(np.linalg.norm(seen @ self.root, 2)), 1.0) ** 2
 
 
 class Solved:
