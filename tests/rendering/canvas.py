@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import zoom
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -119,10 +120,7 @@ def smooth_step(low: float, high: float, value: FloatArray) -> FloatArray:
 
 def resize_linear(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Resample a grid of cell means, linearly, to ``shape``; the borders are held."""
-    for axis in (0, 1):
-        position = (np.arange(shape[axis]) + 0.5) * (values.shape[axis] / shape[axis]) - 0.5
-        values = _interpolate(values, np.clip(position, 0, values.shape[axis] - 1), axis, smooth=False)
-    return values
+    return np.asarray(zoom(values, np.divide(shape, values.shape), order=1, mode="nearest", grid_mode=True))
 
 
 def _centers(count: int, texel_m: float) -> FloatArray:

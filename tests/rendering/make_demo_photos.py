@@ -17,21 +17,22 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.spatial.transform import Rotation
 from tests.rendering.courtyard import DEPTH_M, WIDTH_M, courtyard
-from tests.rendering.photos import PhotoCamera, develop, render
+from tests.rendering.photos import develop, render
 from tests.rendering.scene import Scene
 from tests.simulated.path import loop_path
 
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.demo.survey import CAMERA_PARAMS, NUM_ROWS_AROUND, PATH_FILE, PHOTOS
+from rangesfm.demo.survey import CAMERA_MODEL, CAMERA_PARAMS, NUM_ROWS_AROUND, PATH_FILE, PHOTOS
 
 FloatArray = npt.NDArray[np.float64]
 
 NUM_PHOTOS = 40
-CAMERA = PhotoCamera(960, 640, CAMERA_PARAMS[0], CAMERA_PARAMS[3])
+CAMERA = pycolmap.Camera(model=CAMERA_MODEL, width=960, height=640, params=CAMERA_PARAMS)
 
 _FIRST_PHOTO = datetime(2026, 5, 14, 16, 20, 30, tzinfo=timezone(timedelta(hours=2)))
 _JPEG_QUALITY = 80  # 40 photos are 4 MB, and as many of their features match as at 92
@@ -52,22 +53,22 @@ def walk() -> tuple[CameraPath, FloatArray]:
     return path, _FIRST_PHOTO.timestamp() + np.arange(NUM_PHOTOS) + np.round(stray, 3)
 
 
-def take_photo(scene: Scene, camera: PhotoCamera, path: CameraPath, times_s: FloatArray, number: int) -> Image.Image:
+def take_photo(scene: Scene, path: CameraPath, times_s: FloatArray, number: int) -> Image.Image:
     """The photo with that number, from 0, as its camera develops it."""
     rng = np.random.default_rng([0, 3, number])
     cam_from_world = path.world_from_cam(times_s)[number].T
     translation = -cam_from_world @ path.centers(times_s)[number]
-    radiance = render(scene, camera, np.column_stack([cam_from_world, translation]))
+    radiance = render(scene, CAMERA, np.column_stack([cam_from_world, translation]))
     exposure = float(np.exp(0.12 * np.sin(0.7 * number) + 0.05 * rng.standard_normal()))
     return Image.fromarray(develop(radiance, exposure, rng))
 
 
-def photo_exif(camera: PhotoCamera, timestamp_s: float, zone: tzinfo) -> Image.Exif:
+def photo_exif(timestamp_s: float, zone: tzinfo) -> Image.Exif:
     """The camera's notes about a photo: its make, the time to the millisecond, the focal length."""
     milliseconds = round(timestamp_s * 1000)
     time = datetime.fromtimestamp(milliseconds // 1000, zone)
     # The 35 mm equivalent compares diagonals; the diagonal of the film is 43.27 mm.
-    equivalent_mm = camera.focal_px * 43.27 / float(np.hypot(camera.width_px, camera.height_px))
+    equivalent_mm = CAMERA.focal_length * 43.27 / float(np.hypot(CAMERA.width, CAMERA.height))
     exif = Image.Exif()
     exif[Base.Make] = "rangesfm"
     exif[Base.Model] = "simulated camera"
@@ -107,8 +108,8 @@ def main() -> None:
     scene = courtyard()
 
     def make(number: int) -> None:
-        exif = photo_exif(CAMERA, float(times_s[number]), _FIRST_PHOTO.tzinfo or timezone.utc)
-        photo = take_photo(scene, CAMERA, path, times_s, number)
+        exif = photo_exif(float(times_s[number]), _FIRST_PHOTO.tzinfo or timezone.utc)
+        photo = take_photo(scene, path, times_s, number)
         photo.save(folder / names[number], quality=_JPEG_QUALITY, optimize=True, exif=exif)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -8,10 +8,9 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 from tests.rendering.canvas import FloatArray
 
-# Radiance that a texture's byte 255 stands for; bytes hold its square root, which is finer in the dark, like the eye.
-_MAX_RADIANCE = 2.0
 _NUM_MIP_LEVELS = 5
 
 
@@ -58,36 +57,26 @@ class Texture:
 
     def __init__(self, radiance: FloatArray):
         """Take (3, h, w) linear radiance, row 0 the upper edge, texels filling the rectangle."""
-        levels = [radiance]
-        while len(levels) < _NUM_MIP_LEVELS and levels[-1].shape[1] % 2 == 0 and levels[-1].shape[2] % 2 == 0:
-            fine = levels[-1]
-            levels.append(_halved(fine))
-        self._heights = np.array([level.shape[1] for level in levels])
-        self._widths = np.array([level.shape[2] for level in levels])
-        self._starts = np.concatenate([[0], np.cumsum(self._heights * self._widths)])
-        self._texels = np.concatenate([_encode(level) for level in levels])
+        self._levels = [radiance]
+        while len(self._levels) < _NUM_MIP_LEVELS and not (np.array(self._levels[-1].shape[1:]) % 2).any():
+            fine = self._levels[-1]
+            self._levels.append(fine.reshape(3, fine.shape[1] // 2, 2, fine.shape[2] // 2, 2).mean(axis=(2, 4)))
 
     @property
     def num_texels(self) -> int:
         """Number of texels at the finest resolution."""
-        return int(self._starts[1])
+        return int(self._levels[0][0].size)
 
     def sample(self, u: FloatArray, v: FloatArray, level: npt.NDArray[np.int8]) -> FloatArray:
         """(n, 3) radiance at ``u``, ``v`` in [0, 1], interpolated on the resolution ``level``, 0 the finest."""
-        level = np.clip(level, 0, len(self._widths) - 1)
-        width, height = self._widths[level], self._heights[level]
-        x = np.clip(u * width.astype(np.float32) - np.float32(0.5), 0, None)
-        y = np.clip(v * height.astype(np.float32) - np.float32(0.5), 0, None)
-        left, top = np.minimum(x.astype(np.intp), width - 1), np.minimum(y.astype(np.intp), height - 1)
-        weight_x, weight_y = np.minimum(x - left, 1)[:, None], np.minimum(y - top, 1)[:, None]
-        right = np.where(left < width - 1, 1, 0)
-        below = np.where(top < height - 1, width, 0)
-        index = self._starts[level] + top * width + left
-        upper = _mix(self._texels.take(index), self._texels.take(index + right), weight_x)
-        index += below
-        lower = _mix(self._texels.take(index), self._texels.take(index + right), weight_x)
-        root = upper + weight_y * (lower - upper)
-        return np.asarray(root[:, :3] ** 2 * np.float32(_MAX_RADIANCE / 255**2))
+        found = np.empty((len(u), 3), dtype=np.float32)
+        level = np.clip(level, 0, len(self._levels) - 1)
+        for number, texels in enumerate(self._levels):
+            chosen = level == number
+            _, height, width = texels.shape
+            at = np.stack([v[chosen] * height, u[chosen] * width]) - np.float32(0.5)
+            found[chosen] = np.stack([map_coordinates(band, at, order=1, mode="nearest") for band in texels], axis=1)
+        return found
 
 
 class Sky:
@@ -109,13 +98,7 @@ class Sky:
         size = self._clouds.shape[0]
         # Clouds lie on a plane overhead; the added height keeps them from crowding at the horizon.
         position = unit[:, :2] / (up + np.float32(0.15)) * np.float32(0.07 * size) + np.float32(0.5 * size)
-        low = np.floor(position).astype(np.intp)
-        weight = (position - low).astype(np.float32)
-        x0, y0 = (low % size).T
-        x1, y1 = ((low + 1) % size).T
-        upper = self._clouds[y0, x0] * (1 - weight[:, 0]) + self._clouds[y0, x1] * weight[:, 0]
-        lower = self._clouds[y1, x0] * (1 - weight[:, 0]) + self._clouds[y1, x1] * weight[:, 0]
-        thick = (upper + weight[:, 1] * (lower - upper))[:, None]
+        thick = map_coordinates(self._clouds, position.T[::-1], order=1, mode="grid-wrap")[:, None]
         return np.asarray(clear + thick * (self.cloud - clear), dtype=np.float32)
 
 
@@ -133,27 +116,3 @@ class Scene:
 
     surfaces: Sequence[Surface]
     sky: Sky
-
-
-def _encode(radiance: FloatArray) -> npt.NDArray[np.uint32]:
-    """(h * w,) four bytes per texel in one word, so that one look-up fetches a colour."""
-    root = np.sqrt(np.clip(radiance, 0, _MAX_RADIANCE) * np.float32(255**2 / _MAX_RADIANCE)) + np.float32(0.5)
-    texels = np.zeros((radiance.shape[1] * radiance.shape[2], 4), dtype=np.uint8)
-    for channel in range(3):
-        texels[:, channel] = root[channel].ravel()
-    return texels.view(np.uint32)[:, 0]
-
-
-def _halved(fine: FloatArray) -> FloatArray:
-    """Means of two by two texels."""
-    rows = fine[:, ::2] + fine[:, 1::2]
-    return np.asarray(np.float32(0.25) * (rows[:, :, ::2] + rows[:, :, 1::2]))
-
-
-def _mix(left: npt.NDArray[np.uint32], right: npt.NDArray[np.uint32], weight: FloatArray) -> FloatArray:
-    left_bytes = left.view(np.uint8).reshape(-1, 4).astype(np.float32)
-    right_bytes = right.view(np.uint8).reshape(-1, 4).astype(np.float32)
-    right_bytes -= left_bytes
-    right_bytes *= weight
-    right_bytes += left_bytes
-    return right_bytes

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from PIL.ExifTags import IFD, Base
 from tests.rendering.make_demo_photos import photo_exif, walk, write_path
-from tests.rendering.photos import PhotoCamera
 
 from rangesfm.demo.survey import PATH_FILE
 
@@ -30,6 +29,6 @@ def test_shipped_path_is_the_way_of_that_camera(tmp_path: Path) -> None:
 
 
 def test_time_just_before_a_full_second_keeps_its_second() -> None:
-    exif = photo_exif(PhotoCamera(960, 640, 750.0), 1_000_000_000.9996, timezone.utc).get_ifd(IFD.Exif)
+    exif = photo_exif(1_000_000_000.9996, timezone.utc).get_ifd(IFD.Exif)
     assert exif[Base.DateTimeOriginal] == "2001:09:09 01:46:41"
     assert exif[Base.SubsecTimeOriginal] == "000"

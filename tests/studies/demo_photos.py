@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from tests.rendering.courtyard import courtyard
-from tests.rendering.make_demo_photos import CAMERA, take_photo, walk
+from tests.rendering.make_demo_photos import take_photo, walk
 
 from rangesfm.demo.survey import NUM_PHOTOS, PHOTOS
 
@@ -28,7 +28,7 @@ def main() -> int:
     scene, (path, times_s) = courtyard(), walk()
     is_good = True
     for number in parser.parse_args().numbers:
-        rendered = take_photo(scene, CAMERA, path, times_s, number)
+        rendered = take_photo(scene, path, times_s, number)
         with Image.open(PHOTOS / f"IMG_{number + 1:04d}.jpg") as photo:
             error = float(np.abs(_averaged(rendered) - _averaged(photo)).mean())
         print(f"photo {number}: {error:.2f}")
