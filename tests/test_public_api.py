@@ -28,10 +28,6 @@ def modules_after(code: str) -> set[str]:
     return set(json.loads(done.stdout))
 
 
-def test_import_loads_nothing_heavy() -> None:
-    assert not HEAVY & modules_after("import rangesfm")
-
-
 def test_errors_and_the_command_line_need_nothing_heavy() -> None:
     assert not HEAVY & modules_after("import rangesfm.cli; rangesfm.InputError, rangesfm.GeometryError")
 

@@ -218,18 +218,6 @@ def test_traceback_is_shown_to_those_who_ask(
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_closed_stderr_is_no_error(folder: Path) -> None:
-    done = run("bash", "-c", f'"{sys.executable}" -m rangesfm ranges uwb.csv 2>&-', cwd=folder)
-    assert done.returncode == 0
-    assert "canonical" in done.stdout
-
-
-def test_a_closed_stream_is_a_file_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", None)
-    assert main(["--version"]) == 0
-    assert sys.stderr.writable()
-
-
 def test_reader_that_goes_away_is_no_error(folder: Path) -> None:
     script = f'"{sys.executable}" -m rangesfm ranges uwb.csv | true; echo "${{PIPESTATUS[0]}}"'
     done = run("bash", "-c", script, cwd=folder)

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tests.export.models import centers_of, read_ply, synthesized, xyz
-from tests.outputs import names_in, paths_in
+from tests.outputs import names_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
@@ -22,7 +22,6 @@ from rangesfm.export import (
     OFFSET_NAME,
     export_model,
     write_camera_positions,
-    write_model,
 )
 from rangesfm.pipeline.export_result import export_result
 from rangesfm.util.geometry.similarity import Similarity
@@ -57,24 +56,6 @@ def test_colmap_models_are_read_back_whole(tmp_path: Path, model: pycolmap.Recon
     assert read.compute_mean_reprojection_error() == pytest.approx(model.compute_mean_reprojection_error())
     for image_name, center in centers_of(model).items():
         np.testing.assert_allclose(centers_of(read)[image_name], center, rtol=1e-14)
-
-
-def test_a_model_replaces_an_older_one_whole(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
-    write_model(model, tmp_path / "0", as_text=True)
-    write_model(model, tmp_path / "0")
-    assert {path.suffix for path in paths_in(tmp_path / "0")} == {".bin"}
-    assert names_in(tmp_path) == ["0"]
-
-
-def test_a_model_with_files_of_somebody_else_in_it_is_not_replaced(
-    tmp_path: Path, model: pycolmap.Reconstruction
-) -> None:
-    write_model(model, tmp_path / "0")
-    (tmp_path / "0" / "fused.ply").write_text("hours of work")
-    before = {path: path.read_bytes() for path in paths_in(tmp_path / "0")}
-    with pytest.raises(InputError, match=r"fused\.ply: is not a file that rangesfm wrote"):
-        write_model(model, tmp_path / "0", as_text=True)
-    assert {path: path.read_bytes() for path in paths_in(tmp_path / "0")} == before
 
 
 def test_the_tum_trajectory_holds_world_from_camera_in_order_of_time(
@@ -154,11 +135,6 @@ def test_the_transform_carries_the_unscaled_model_to_the_metric_one(
         np.testing.assert_allclose(np.loadtxt(matrix) @ [*center, 1.0], [*expected, 1.0], rtol=1e-12)
 
 
-def test_a_transform_that_is_not_known_cannot_be_written(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
-    with pytest.raises(InputError, match="needs metric_from_sfm"):
-        export_model(model, ["transform"], tmp_path)
-
-
 def test_model_aligner_positions_are_those_of_the_photos(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
     (path,) = export_model(model, ["model_aligner"], tmp_path)
     lines = [line.split() for line in path.read_text().splitlines()]
@@ -181,17 +157,6 @@ def test_an_unknown_format_is_named_with_the_known_ones_before_anything_is_writt
         export_model(model, ["tum", "las"], tmp_path / "out")
     assert error.value.exit_status == 2
     assert not (tmp_path / "out").exists()
-
-
-def test_formats_after_one_that_fails_are_written_and_all_failures_told(
-    tmp_path: Path, model: pycolmap.Reconstruction
-) -> None:
-    with pytest.raises(InputError, match=r"2 of 4 formats could not be written: transform: .* needs metric") as error:
-        export_model(model, ["transform", "tum", "opf", "ply"], tmp_path)
-    failed, written = error.value.advice
-    assert failed.startswith("opf: the format 'opf' needs the stddev")
-    assert written == "these were written: tum, ply"
-    assert names_in(tmp_path) == ["points.ply", "trajectory.tum"]
 
 
 def write_photos(folder: Path, model: pycolmap.Reconstruction) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import shutil
-import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,23 +16,21 @@ import pycolmap
 import pytest
 from tests.known import known
 from tests.listener import Listener
-from tests.outputs import names_in, paths_below
+from tests.outputs import names_in
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.colmap.model_files import read_model
-from rangesfm.errors import GeometryError, InputError
+from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers import read_ranges
-from rangesfm.pipeline import run
 from rangesfm.pipeline.export_result import export_result
-from rangesfm.pipeline.run import refine_model, scale_model
-from rangesfm.progress import Journal, Progress
+from rangesfm.pipeline.run import refine_model, run_survey, scale_model
+from rangesfm.progress import Progress
 from rangesfm.result.places import path_in, recorded_path
 from rangesfm.result.result_folder import ResultFolder, is_refined_model
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import KEYS, Survey
-from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
@@ -157,15 +154,6 @@ def test_the_result_names_its_inputs_by_their_hashes(scaled: Done) -> None:
     recorded = recorded_path(survey.ranges.path, survey.output.path)
     assert by_path[survey.ranges.path] == {"path": recorded, **expected}
     assert {path.name for path in by_path} >= {"cameras.bin", "images.bin", "points3D.bin", "uwb.csv"}
-
-
-def test_refused_run_leaves_the_result_before_it(survey: Survey, scaled: Done) -> None:
-    shutil.copytree(scaled.survey.output.path, survey.output.path)
-    before = {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)}
-    strict = survey.changed({"scale.max_relative_stddev": 1e-6})
-    with pytest.raises(GeometryError, match="the scale is only known to"):
-        refine_model(strict, progress=Progress())
-    assert {path: path.stat().st_mtime_ns for path in paths_below(survey.output.path)} == before
 
 
 def test_ranges_held_out_check_the_result(survey: Survey) -> None:
@@ -393,25 +381,6 @@ def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> N
     assert list(result.warnings) == listener.messages != []
 
 
-def test_journal_times_stages_and_all_of_it() -> None:
-    listener = Listener()
-    journal = Journal(listener)
-    with journal.stage("scale"):
-        time.sleep(0.01)
-    with journal.timed("quick"):
-        pass
-    journal.warn("careful")
-    journal.note("in feet")
-    with journal.stage("scale"):
-        pass
-    assert listener.stages == ["scale"]
-    assert (journal.warnings, journal.notes) == (["careful"], ["in feet"])
-    assert listener.messages == ["careful", "in feet"]
-    seconds = journal.all_seconds()
-    assert seconds.keys() == {"scale", "quick", "total"}
-    assert 0.01 <= seconds["scale"] <= seconds["total"]
-
-
 @pytest.mark.parametrize("key", [item.dotted for item in KEYS if item.role == "file"])
 def test_no_file_that_a_survey_reads_is_overwritten(key: str, survey: Survey) -> None:
     path = survey.output.path / "ranges.csv"
@@ -446,22 +415,7 @@ def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(
     assert low < walked_survey.site_from_sfm.scale < high
 
 
-@pytest.mark.parametrize(
-    ("model", "refine", "begins"),
-    [(None, True, "from photos"), ("m", True, "from a model, refined"), ("m", False, "from a model")],
-)
-def test_a_survey_begins_with_its_photos_or_with_its_model(
-    model: str | None, refine: bool, begins: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun: list[str] = []
-
-    def from_model(*_: object, refine: bool, or_scale: bool) -> None:
-        assert or_scale
-        begun.append("from a model" + refine * ", refined")
-
-    monkeypatch.setattr(run, "_from_photos", lambda *_, **__: begun.append("from photos"))
-    monkeypatch.setattr(run, "_from_model", from_model)
-    images = {"path": "photos"} | ({} if model is None else {"model": model})
-    survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
-    run.run_survey(survey, progress=Progress())
-    assert begun == [begins]
+def test_a_run_of_a_model_scales_it_alone_where_no_refinement_is_wanted(survey: Survey) -> None:
+    result = run_survey(survey.changed({"refine.enabled": False, "report.enabled": False}))
+    assert result.summary.refine is None
+    assert not (survey.output.path / "sparse_metric").exists()

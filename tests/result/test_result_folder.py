@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.outputs import names_in, paths_in
+from tests.outputs import names_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
 from rangesfm.pipeline.map_photos import refuse_to_overwrite
-from rangesfm.result.result_folder import RESULT_FILES, new_result, read_result_folder
+from rangesfm.result.result_folder import RESULT_FILES, read_result_folder
 from rangesfm.result.result_tables import RESULT_TABLES, RangesAsUsed
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import survey_from_tables
@@ -65,38 +65,6 @@ def test_a_model_that_is_read_may_stand_beside_the_results_and_not_among_them(tm
             refuse_to_overwrite(survey)
     for images in ({"path": "photos"}, {"model": "photos/out/sparse/0"}):
         refuse_to_overwrite(survey_from_tables({"images": images, "output": {"path": "photos/out"}}, tmp_path))
-
-
-class TestNewResult:
-    @pytest.fixture
-    def folder(self, tmp_path: Path) -> Path:
-        self.write(tmp_path, "result.json", "report.html", "ranges.csv", "sparse_metric")
-        for name in ("sparse", "mine.txt"):
-            (tmp_path / name).write_text("mine")
-        return tmp_path
-
-    def write(self, folder: Path, *names: str) -> None:
-        with new_result(folder) as staged:
-            for name in names:
-                (staged / name).write_text(name)
-
-    def test_takes_the_place_of_all_of_the_earlier_one_and_of_nothing_else(self, folder: Path) -> None:
-        self.write(folder, "result.json", "images.csv")
-        assert files_of(folder) == {"sparse", "mine.txt", "result.json", "images.csv"}
-
-    def test_that_fails_leaves_the_earlier_one_whole(self, folder: Path) -> None:
-        before = {path.name: path.read_text() for path in paths_in(folder)}
-        with pytest.raises(ZeroDivisionError), new_result(folder) as staged:
-            (staged / "ranges.csv").write_text(str(1 / 0))
-        assert {path.name: path.read_text() for path in paths_in(folder)} == before
-
-    @pytest.mark.parametrize("name", ["markers.csv", "reference.csv", "images.csv", "sparse_scaled", "report.html"])
-    def test_is_refused_where_somebody_else_has_a_file_of_that_name(self, name: str, folder: Path) -> None:
-        (folder / name).write_text("of somebody else")
-        before = {path.name: path.read_text() for path in paths_in(folder)}
-        with pytest.raises(InputError, match=f"{name}: is not a file that rangesfm wrote"), new_result(folder):
-            pytest.fail("the block was entered")
-        assert {path.name: path.read_text() for path in paths_in(folder)} == before
 
 
 def write_document(folder: Path, **changes: Any) -> Path:

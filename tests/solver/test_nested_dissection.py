@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import block_diag, csr_array
 
-from rangesfm.solver.nested_dissection import NestedFactor, SingularError, cost_of_factor, fronts_of
+from rangesfm.solver.nested_dissection import NestedFactor, SingularError, cost_of_factor
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -66,27 +66,6 @@ def test_a_dense_matrix_is_one_front() -> None:
     right = np.ones(len(matrix))
     factor = NestedFactor(matrix.copy(), starts, np.zeros(16, dtype=bool))
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix, right), atol=1e-13)
-
-
-def test_every_block_is_eliminated_once_and_its_ties_are_in_its_front_or_before() -> None:
-    tied = field(12, 2)
-    fronts = fronts_of(tied, np.arange(146) >= 144)
-    assert len(fronts) > 20
-    assert sorted(np.concatenate([front.own for front in fronts])) == list(range(146))
-    done: set[int] = set()
-    for front in fronts:
-        neighbours = set(csr_array(tied[front.own]).indices.tolist())
-        assert neighbours <= done | set(front.own.tolist()) | set(front.boundary.tolist())
-        for child in front.children:
-            assert set(fronts[child].boundary.tolist()) <= {*front.own.tolist(), *front.boundary.tolist()}
-        done |= set(front.own.tolist())
-    assert set(fronts[-1].own.tolist()) == {144, 145}
-
-
-def test_two_unequal_fields_fall_apart_at_the_narrowest_place_between_them() -> None:
-    tied = block_diag([field(6).toarray(), np.eye(1), field(8).toarray()]).toarray()
-    tied[36, 30:45] = tied[30:45, 36] = True  # one block is tied to an edge of either field
-    assert fronts_of(csr_array(tied), np.zeros(101, dtype=bool))[-1].own.tolist() == [36]
 
 
 def test_the_cost_of_a_field_grows_far_slower_than_that_of_a_dense_matrix() -> None:

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.solver.test_covariance import Joint, covariance_of_all, joint, model, variable
 
-from rangesfm.solver.part_errors import PartSteps, map_errors, steps_of
 from rangesfm.util.geometry.map_errors import MapErrors, MapPoint
 
 Array = npt.NDArray[np.float64]
@@ -61,14 +60,6 @@ def test_two_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_e
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * expected.max())
 
 
-def test_what_is_held_has_no_errors() -> None:
-    survey = joint(model(), hold_first=True)
-    errors = found_in(survey).parts["frame"]
-    first = errors.row_of[min(survey.reconstruction.reg_frame_ids())]
-    assert not errors.modes[first].any()
-    assert not errors.rests[first].any()
-
-
 def test_few_modes_leave_keyframes_about_as_certain_relative_to_each_other_as_they_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -104,77 +95,3 @@ def test_a_stated_uncertainty_of_the_scale_replaces_that_of_the_problem() -> Non
     by_scale = np.sqrt(along @ (wide - exact) @ along) / 0.1
     assert by_scale == pytest.approx(float(np.linalg.norm(centers[1] - centers[0])), rel=0.1)
     assert np.sqrt(along @ wide @ along) == pytest.approx(0.1 * np.linalg.norm(centers[1] - centers[0]), rel=0.15)
-
-
-def test_the_same_problem_has_the_same_modes_each_time() -> None:
-    first, second = (found_in(joint(model(), hold_first=True)) for _ in range(2))
-    for kind, errors in first.parts.items():
-        assert np.array_equal(errors.modes, second.parts[kind].modes)
-
-
-def covariance_like(size: int, rank: int, seed: int = 0) -> Array:
-    """Return a random covariance matrix of a rank."""
-    factor = np.random.default_rng(seed).normal(size=(size, rank))
-    return factor @ factor.T
-
-
-def some_parts() -> list[PartSteps]:
-    """Return two frames around an anchor and a camera that is held; the first two columns belong to none of them."""
-    rng = np.random.default_rng(1)
-    return [
-        PartSteps("frame", 7, 5, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
-        PartSteps("anchor", "A", 2, np.diag([1.0, 2.0, 3.0]), np.ones(3)),
-        PartSteps("camera", 3, None, np.eye(2), np.array([0.1, 0.2])),
-        PartSteps("frame", 8, 8, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
-    ]
-
-
-def of_all_numbers(parts: list[PartSteps], covariance: Array) -> Array:
-    """Return the (size, numbers) derivatives of all numbers of all parts, part by part."""
-    steps = []
-    for part in parts:
-        slopes = np.zeros((len(covariance), len(part.unit)))
-        if part.start is not None:
-            slopes[part.start : part.start + part.by_step.shape[1]] = part.by_step.T
-        steps.append(slopes)
-    return np.hstack(steps)
-
-
-def errors_of(
-    parts: list[PartSteps], covariance: Array, of_scale: Array | None = None, scale_stddev: float = 0.0
-) -> MapErrors:
-    widths, steps = {part.start: part.by_step.shape[1] for part in parts}, steps_of(parts, len(covariance))
-    by_scale = np.zeros(steps.shape[1]) if of_scale is None else steps.T @ covariance @ of_scale / scale_stddev**2
-    return map_errors(
-        parts,
-        lambda right: steps.T @ (covariance @ (steps @ right)),
-        [part.covariance(lambda at: covariance[at : at + widths[at], at : at + widths[at]]) for part in parts],
-        by_scale,
-        scale_stddev,
-    )
-
-
-def test_the_modes_of_few_numbers_have_their_whole_covariance() -> None:
-    parts, covariance = some_parts(), covariance_like(11, 11)
-    found = errors_of(parts, covariance).parts
-    assert {kind: of.ids for kind, of in found.items()} == {"frame": (7, 8), "anchor": ("A",), "camera": (3,)}
-    modes = np.vstack([found["frame"].modes[0], found["anchor"].modes[0], found["camera"].modes[0]])
-    modes = np.vstack([modes, found["frame"].modes[1]])
-    steps = of_all_numbers(parts, covariance)
-    expected = steps.T @ covariance @ steps
-    np.testing.assert_allclose(modes @ modes.T, expected, rtol=0, atol=1e-8 * expected.max())
-    for of in found.values():
-        assert np.abs(of.rests).max() < 1e-8 * expected.max()
-
-
-def test_parts_change_with_the_scale_as_their_covariance_with_it_says() -> None:
-    parts, covariance = some_parts(), covariance_like(11, 11)
-    of_scale = np.random.default_rng(2).normal(size=11)
-    scale_stddev = float(np.sqrt(of_scale @ covariance @ of_scale))
-    errors = errors_of(parts, covariance, of_scale, scale_stddev)
-    assert errors.scale_stddev == scale_stddev
-    expected = of_all_numbers(parts, covariance).T @ covariance @ of_scale / scale_stddev**2
-    found = errors.parts
-    np.testing.assert_allclose(found["frame"].by_scale, [expected[:4], expected[9:]])
-    np.testing.assert_allclose(found["anchor"].by_scale, [expected[4:7]])
-    np.testing.assert_array_equal(found["camera"].by_scale, np.zeros((1, 2)))

@@ -184,15 +184,6 @@ class TestNewFolder:
                 (folder / text).write_text(text)
         assert [path.name for path in paths_below(tmp_path)] == ["a", "b"]
 
-    def test_leaves_an_old_one_with_files_of_somebody_else(self, tmp_path: Path) -> None:
-        with new_folder(tmp_path / "a") as folder:
-            (folder / "model.bin").write_text("old")
-        (tmp_path / "a" / "dense").mkdir()
-        (tmp_path / "a" / "dense" / "fused.ply").write_text("hours of work")
-        with pytest.raises(InputError, match=r"fused\.ply: is not a file"), new_folder(tmp_path / "a"):
-            pytest.fail("the block was entered")
-        assert [path.name for path in paths_below(tmp_path)] == ["a", "dense", "fused.ply", "model.bin"]
-
     @pytest.mark.parametrize("num_renames", [1, 2])
     @pytest.mark.parametrize("error", [KeyboardInterrupt, PermissionError])
     def test_leaves_the_old_one_when_interrupted(
