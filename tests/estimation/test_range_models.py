@@ -92,8 +92,9 @@ def test_both_change_alike_with_the_keyframes(scene: Scene) -> None:
     by_pose = np.zeros((len(rows), len(scene.in_map.poses), 6))
     for k in range(2):
         by_pose[scene.ranges.rows, scene.linear.pose[:, k]] += scene.linear.by_pose[:, 0, k]
-    on_path, arms_m = scene.observations.subset(rows), scene.observations.tag_from_center
-    placed, turns = scene.metric_from_sfm, scene.sfm.world_from_cam[on_path.before]
+    on_path, placed = scene.observations.subset(rows), scene.metric_from_sfm
+    turns = placed.rotation @ scene.sfm.world_from_cam[on_path.before]
+    arms_m = scene.observations.tag_from_center @ placed.rotation.T
     found = by_poses(range_gradient(scene.problem, scene.state), placed, turns, arms_m, on_path).toarray()
     seen = found.reshape(len(rows), -1, 6)
     by_pose = by_pose[:, : seen.shape[1]]
