@@ -16,9 +16,9 @@ from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
@@ -54,7 +54,7 @@ class Run:
 
     survey: MadeSurvey
     estimate: ScaleEstimate | None
-    diagnosis: Diagnosis | None
+    diagnosis: MistakeTests | None
     on_map: RangesOnMap | None = None
     refusal: str = ""
 

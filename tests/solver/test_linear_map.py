@@ -34,14 +34,3 @@ def test_the_estimate_is_that_of_generalised_least_squares_with_priors() -> None
     assert solved.residual @ solved.residual == pytest.approx(squares, rel=1e-8)
     assert len(solved.residual) == 10
     np.testing.assert_allclose(solved.residual[8:], prior_left, rtol=1e-7)
-
-
-def test_redundancy_is_what_the_unknowns_leave_of_what_a_known_map_shows() -> None:
-    """A mistake in a prior, which the observations of a known map do not show at all, is checked by none of them."""
-    design = np.array([[1.0], [1.0], [1.0], [1.0]])
-    solved = Solved(np.eye(3), design, np.zeros(4))
-    effects = np.eye(4)[:, [0]], np.eye(4)[:, [3]]
-    in_range, in_prior = solved.mistakes(effects)
-    assert in_range.redundancy_against(effects[0][:3]) == pytest.approx(3 / 4)
-    assert in_prior.is_seen
-    assert in_prior.redundancy_against(effects[1][:3]) == 0.0

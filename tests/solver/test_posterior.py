@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.mistakes import Mistake, estimated
 from rangesfm.solver.bending import Bending, bending_parts
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component, learnt_sizes, noise_of_sizes
@@ -94,11 +95,26 @@ def test_a_mistake_is_found_with_its_size_also_where_it_is_not_used() -> None:
     columns[3] = 1.0
     exact = replace(problem, residual_m=design @ np.arange(7.0) - 0.8 * columns[:, 0])
     for problem in (exact, replace(exact, is_used=np.arange(15) != 3)):
-        found = problem.mistake(columns)
+        [found] = estimated(problem, [Mistake("one", -columns)])
         assert found.sizes[0] == pytest.approx(0.8)
         assert found.statistic == pytest.approx((0.8 / found.stddevs[0]) ** 2)
     # The mistake does not pass for noise.
-    assert exact.learnt(columns).mistake(columns).sizes[0] == pytest.approx(0.8)
+    [found] = estimated(exact.learnt(columns), [Mistake("one", -columns)])
+    assert found.sizes[0] == pytest.approx(0.8)
+
+
+def test_redundancy_is_what_the_unknowns_leave_of_what_a_known_map_shows() -> None:
+    """A mistake in a prior, which the observations of a known map do not show at all, is checked by none of them."""
+    three = replace(
+        kind("lengths", 3, 0, 1.0, is_placed=False), design=np.ones((3, 1)), by_pose=np.zeros((3, 6 * NUM_POSES))
+    )
+    problem = joined([replace(three, prior_residual=np.zeros(1), prior_design=np.ones((1, 1)))], Shaken())
+    in_length, in_prior = estimated(
+        problem, [Mistake("length", np.eye(4)[:, [0]]), Mistake("prior", np.eye(4)[:, [3]])]
+    )
+    assert in_length.redundancy == pytest.approx(3 / 4)
+    assert in_prior.is_seen
+    assert in_prior.redundancy == 0.0
 
 
 def test_what_nobody_observes_is_as_certain_as_its_conditional_distribution() -> None:

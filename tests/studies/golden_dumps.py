@@ -261,10 +261,10 @@ def length_equations_of(metric: MetricResult) -> Values:
     if found is None:
         return {}
     return {
-        "lengths residual": found.too_long_m,
+        "lengths residual": np.concatenate([each.sizes for each in found.errors]),
         "lengths derivatives": found.by_metre,
-        "lengths stddev": found.stddev_m,
-        "lengths redundancy": found.redundancy,
+        "lengths stddev": np.concatenate([each.stddevs for each in found.errors]),
+        "lengths redundancy": np.array([each.redundancy for each in found.errors]),
     }
 
 

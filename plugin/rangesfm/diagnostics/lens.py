@@ -16,12 +16,12 @@ from scipy.spatial.distance import pdist
 
 from rangesfm import solver
 from rangesfm.colmap.reprojection import point_errors
+from rangesfm.diagnostics.scale_bound import RISK
 from rangesfm.errors import SolverError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR, MEDIAN_FACTOR
 from rangesfm.measurements.kind import Doubt
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bundle_adjustment import bundle_adjustment, keyframe_centers
-from rangesfm.solver.mistakes import RISK
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.util.geometry.similarity import align_points
 

@@ -15,6 +15,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.errors import InputError, number_text
 from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.mistakes import FALSE_ALARM_RATE
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
@@ -23,7 +24,6 @@ from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers.columns import CANONICAL
 from rangesfm.measurements.ranges.readers.table import MAPPED, TABLE
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.clock_times import are_seconds_since_1970

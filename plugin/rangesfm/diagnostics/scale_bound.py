@@ -17,27 +17,45 @@ from scipy import special
 from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
-from rangesfm.solver.mistakes import RISK, HiddenMistake
+from rangesfm.measurements.mistake_words import mistake_in_words
+from rangesfm.measurements.mistakes import MistakeTest, noncentrality
 from rangesfm.solver.posterior import ScaleUncertainty
 
+RISK = 1e-4
+"""Probability with which the scale may be off by more than the bound."""
 
-def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) -> tuple[float, str]:
+
+def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[MistakeTest]) -> tuple[float, str]:
     """Return the bound on the scale's error, in its logarithm, and what limits it; inf if a mistake has no limit.
 
     Args:
         uncertainty: of the scale.
-        hidden: mistakes of which one may have been made.
+        hidden: tests of mistakes of which one may have been made.
     """
     bounds = {"": _bound(uncertainty, np.zeros(1), np.ones(1))}
     for mistake in hidden:
-        changes, missed = mistake.sizes
+        (changes, missed), words = _unnoticed(mistake), mistake_in_words(mistake.name, mistake.subject)
         # Only a mistake that exceeds the bound so far can raise it.
         if not np.isfinite(changes).all():
-            return np.inf, mistake.words
+            return np.inf, words
         if np.max(missed * _beyond(uncertainty, changes, max(bounds.values()))) > RISK:
-            bounds[mistake.words] = _bound(uncertainty, changes, missed)
+            bounds[words] = _bound(uncertainty, changes, missed)
     worst = max(bounds, key=bounds.__getitem__)
     return bounds[worst], worst
+
+
+def _unnoticed(test: MistakeTest) -> tuple[Array, Array]:
+    """Return possible changes of the scale's logarithm (k,), and the probabilities (k,) that the test misses them."""
+    if not np.isfinite(test.effect_on_scale):  # no test sees it
+        return np.array([test.most_unnoticed]), np.ones(1)
+    # Change by a mistake that moves the test by one standard deviation.
+    slope = test.effect_on_scale / float(np.sqrt(noncentrality(test.num)))
+    # A mistake that moves the test farther beyond its threshold is missed with a smaller probability than the risk.
+    farthest = np.sqrt(test.threshold) - special.ndtri(RISK)
+    if slope > 0:
+        farthest = min(farthest, test.most_unnoticed / slope)
+    moves = np.linspace(0.0, farthest, 80)
+    return slope * moves, np.asarray(special.chndtr(test.threshold, test.num, moves**2))
 
 
 def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> float:

@@ -18,11 +18,10 @@ from scipy import special
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.kind import Block, Doubt, Measurements
 from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.mistakes import FALSE_ALARM_RATE, MistakeTest, MistakeTests, noncentrality
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.options import RefineOptions
 from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
-from rangesfm.solver.mistakes import MistakeTest, MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
@@ -35,6 +34,10 @@ if TYPE_CHECKING:
 
     from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides
     from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+
+
+# Number of measurements for which it is tried what the others say without them, the most deviating first.
+_NUM_SUSPECTS = 3
 
 
 class Located(ABC):
@@ -390,7 +393,7 @@ def most_contradicting(
         statistic_without: the same with errors that are learnt from the others.
     """
     suspicious = np.array([statistic(row) for row in rows.tolist()])
-    suspects = rows[np.argsort(-suspicious, kind="stable")[:NUM_SUSPECTS]]
+    suspects = rows[np.argsort(-suspicious, kind="stable")[:_NUM_SUSPECTS]]
     found = {row: statistic_without(row) for row in suspects.tolist()}
     worst = max(found, key=found.__getitem__)
     return worst, found[worst]

@@ -16,8 +16,8 @@ from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.scale.scale_estimate import refuse_unknown
 from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.ranges.errors.components import CLOCKS
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
@@ -66,12 +66,12 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     return doubts_of_lens(metric.final, factor, metric.estimate.uncertainty.half_width_95)
 
 
-def _tested(run: SurveyRun, metric: MetricResult) -> Diagnosis:
+def _tested(run: SurveyRun, metric: MetricResult) -> MistakeTests:
     """Return the tests of all kinds, first of those that contradict others, and then of those that place the map.
 
     On a map by the one of two kinds that is wrong, the other seems to have mistakes that nobody made.
     """
-    on_map, by_kind, diagnosis = metric.all_measured, metric.estimate.by_kind, Diagnosis()
+    on_map, by_kind, diagnosis = metric.all_measured, metric.estimate.by_kind, MistakeTests()
 
     def comes_later(kind: KindOnMap) -> tuple[bool, bool]:
         return not any(row.rejected for row in kind.against_others(on_map, by_kind)), not kind.places_map

@@ -129,13 +129,13 @@ def with_likeliest_cause(run: SurveyRun, metric: MetricResult) -> MetricResult:
     The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
     apart the likelier one is corrected, too; the user has asked for it and is told.
     """
-    if not metric.diagnosis.causes:
+    cause = next(iter(metric.diagnosis.causes), None)
+    if cause is None or (correction := cause.correction) is None:
         return metric
     if metric.models:
         run.journal.warn("no mistake is corrected: the map is joined from several models")
         return metric
-    cause, rows = metric.diagnosis.causes[0], metric.diagnosis.rows
-    inputs, log, correction = run.inputs, run.inputs.log, cause.correction
+    inputs, log, rows = run.inputs, run.inputs.log, correction.rows
     known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
     anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in log.tag_ids]).reshape(-1, 3)

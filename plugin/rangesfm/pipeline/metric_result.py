@@ -15,8 +15,8 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefinedRanges, RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.measurements.kind import Doubt, Measurements
+from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.sfm.loops.rounds import LoopClosure
 from rangesfm.survey.inputs import RangingInputs
@@ -105,7 +105,7 @@ class MetricResult:
     refined: RefinedMap | None = None
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
-    diagnosis: Diagnosis = field(default_factory=Diagnosis)
+    diagnosis: MistakeTests = field(default_factory=MistakeTests)
 
     @property
     def trajectory(self) -> Trajectory:

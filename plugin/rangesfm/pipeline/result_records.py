@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Mask, median, rms
-from rangesfm.diagnostics.scale_bound import scale_bound
+from rangesfm.diagnostics.scale_bound import RISK, scale_bound
 from rangesfm.errors import number_text
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
@@ -38,7 +38,6 @@ from rangesfm.result.result_tables import (
     TimeOffsetCurve,
 )
 from rangesfm.result.summary import ResultSummary
-from rangesfm.solver.mistakes import RISK
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity

@@ -11,11 +11,12 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
+from rangesfm.measurements.mistakes import MistakeTest
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import estimates, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
+from rangesfm.measurements.ranges.mistakes.thresholds import estimates
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
@@ -30,7 +31,6 @@ from rangesfm.measurements.ranges.words import RANGES
 from rangesfm.options import LENGTH_M
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.mistakes import MistakeTest
 from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import first_camera_from
 
@@ -143,10 +143,10 @@ def mistakes(on_map: JointMap) -> tuple[MistakeTest, ...]:
     problem = Linearized.by_ranges(in_bins(here, bins, here.noise_stddev_m, {}, np.zeros(len(bins))), here, 0.0)
     found = []
     for test in estimates(problem, [each for of_kind in STANDING for each in of_kind(problem)]):
-        row = row_of(test)
+        row = test.row
         sizes: dict[str, float] = {name: getattr(row, name) for name in SIZES}
         if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest
-            share = test.hypothesis.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
+            share = test.mistake.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
             sizes = {name: share * size for name, size in sizes.items()} | {"smallest_detectable": np.inf}
         limited: dict[str, Any] = {name: np.inf if size > OPEN else size for name, size in sizes.items()}
         found.append(replace(row, **limited))

@@ -14,11 +14,11 @@ from rangesfm.errors import GeometryError
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.kinds_in_words import component_words
 from rangesfm.measurements.mistake_words import mistake_in_words
+from rangesfm.measurements.mistakes import MistakeTest
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_ranges import SIZES, mistakes, why_place_is_open
-from rangesfm.solver.mistakes import MistakeTest
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.processes.threads import with_one_blas_thread
 

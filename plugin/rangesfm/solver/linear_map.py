@@ -1,31 +1,15 @@
-"""The linear Gaussian problem of a map: its best estimate, and estimates of mistakes in it (Baarda; Teunissen).
-
-Let e be the residuals of observations and priors, A their derivatives by the unknowns and H those by the numbers of a
-mistake, all whitened by the residuals' covariance, and e and H projected off A. The size of the mistake is estimated as
-(H'H)^-1 H'e (Teunissen, Network Quality Control, 2024). The statistic is T = e'H (H'H)^-1 H'e; without a mistake it is
-chi-square distributed with as many degrees of freedom as H has columns.
-"""
+"""The linear Gaussian problem of a map, and its best estimate (Gauss and Markov)."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 
 import numpy as np
-from scipy import special
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.util.geometry.numerics import ROUNDING, UNDETERMINED
-
-FALSE_ALARM_RATE = 0.02
-"""Share of surveys without any mistake in which one is named, or a correct length or point is set aside."""
-NUM_SUSPECTS = 3
-"""Number of measurements for which it is tried what the others say without them, the most deviating first."""
-# Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
-_ALPHA, _BETA = 0.001, 0.2
 
 
 @dataclass(frozen=True)
@@ -96,56 +80,6 @@ class LinearMap:
         return Solved(covariance_m2, self.jacobian, self.residual)
 
 
-@dataclass(frozen=True)
-class EstimatedMistake:
-    """A mistake of k numbers, as estimated.
-
-    Attributes:
-        sizes: (k,). root: (k, j) root of their covariance, without directions that the residuals do not show.
-        statistic: chi-square distributed with j degrees of freedom where no such mistake was made.
-        by_unknowns: (p, k) change of the estimate by the mistake.
-        basis: (c + r, j) orthonormal basis of the effect, whitened and projected.
-        smallest_detectable: minimal detectable bias in the worst direction; inf: it cannot be detected.
-        effect_on_log_scale: largest effect of an undetected mistake of that size.
-    """
-
-    sizes: Array
-    root: Array
-    statistic: float
-    by_unknowns: Array
-    basis: Array
-    smallest_detectable: float
-    effect_on_log_scale: float
-
-    @property
-    def num(self) -> int:
-        """Degrees of freedom of the statistic."""
-        return int(self.root.shape[1])
-
-    @property
-    def is_seen(self) -> bool:
-        """True if the residuals show the mistake in every direction."""
-        return self.num == len(self.sizes)
-
-    @property
-    def stddevs(self) -> Array:
-        """(k,) standard deviations of the sizes; inf if a direction is hidden."""
-        return np.linalg.norm(self.root, axis=1) if self.is_seen else np.full(len(self.sizes), np.inf)
-
-    def redundancy_against(self, seen: Array) -> float:
-        """Return how much of the mistake the other observations check, 0 to 1, in the worst direction.
-
-        It is the share of its information in the observations that the unknowns leave (Baarda's redundancy number, for
-        several numbers). A mistake of which the observations of a known map show nothing is not checked by any.
-
-        Args:
-            seen: (c, k) its whitened effect on the observations of a map that is known.
-        """
-        if not self.is_seen or not seen.any():
-            return 0.0
-        return 1 / max(float(np.linalg.norm(seen @ self.root, 2)), 1.0) ** 2
-
-
 class Solved:
     """The decompositions of a linear problem with given errors, which its estimate and all mistakes in it share.
 
@@ -203,39 +137,10 @@ class Solved:
         num = len(self.lower)
         return solve_triangular(self.lower, self._gains[:, :num].T, lower=True, trans=1).T, self._gains[:, num:]
 
-    def mistakes(self, effects: Sequence[Array]) -> list[EstimatedMistake]:
-        """Estimate mistakes, each of k numbers, by effects (c, k) on observations or (c + r, k) on all residuals."""
-        whitened = self.whitened(*effects)
-        left, by_unknowns = self.left(whitened), self.by_unknowns(whitened)
-        ends = np.cumsum([0, *(each.shape[1] for each in effects)]).tolist()
-        parts = (slice(*each) for each in itertools.pairwise(ends))
-        return [self._mistake(whitened[:, part], left[:, part], by_unknowns[:, part]) for part in parts]
-
-    def _mistake(self, whitened: Array, left: Array, by_unknowns: Array) -> EstimatedMistake:
-        """Estimate a mistake, given its whitened effect (c + r, k), what is left of it, and the change by it."""
-        lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
-        basis, values, turns = np.linalg.svd(left / lengths, full_matrices=False)
-        # Of an effect with a smaller squared share the unknowns leave only rounding.
-        shown = values**2 > UNDETERMINED
-        basis, root = basis[:, shown], turns[shown].T / values[shown] / lengths[:, None]
-        pulls, smallest, effect = basis.T @ self.residual, np.inf, np.inf
-        if shown.all():
-            # The mistake with the largest effect among those that are just detectable.
-            size = float(np.sqrt(noncentrality(len(shown))))
-            smallest = size * float(np.linalg.norm(root, 2) if len(root) > 1 else abs(root[0, 0]))
-            effect = size * float(np.linalg.norm(by_unknowns[:1] @ root))
-        return EstimatedMistake(root @ pulls, root, float(pulls @ pulls), by_unknowns, basis, smallest, effect)
-
 
 def _side_by_side(effects: Sequence[Array], num: int) -> Array:
     """Return effects on all ``num`` residuals together, of which some are on the first ones alone."""
     return np.hstack([np.pad(each, ((0, num - len(each)), (0, 0))) for each in effects])
-
-
-@cache
-def noncentrality(num: int) -> float:
-    """Return the noncentrality at which a mistake of ``num`` numbers is found (Baarda's lambda_0)."""
-    return float(special.chndtrinc(special.chdtri(num, _ALPHA), num, _BETA))
 
 
 def regular(covariance: Array) -> Array:

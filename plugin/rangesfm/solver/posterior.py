@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
-from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, Solved, regular
+from rangesfm.solver.linear_map import Columns, LinearMap, Solved, regular
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 
@@ -182,12 +182,6 @@ class JointProblem(LinearMap):
         of_all[self.is_used] = of_used
         return of_all[self.rows[kind]]
 
-    def size_of(self, kind: str) -> Array:
-        """Return the column (c, 1) of a mistake by which all observations of a kind have the map too small."""
-        column = np.zeros((len(self.is_used), 1))
-        column[self.rows[kind], 0] = self.design[self.rows[kind], self.columns.scale]
-        return column
-
     def noise_of(self, kind: str) -> Noise:
         """Return the errors of the observations of one kind, with those of the map, as large as they are in these."""
         found = self.noise.of_rows(self.rows[kind])
@@ -243,15 +237,6 @@ class JointProblem(LinearMap):
         """Return the equations and the errors of some of the observations."""
         priors = self.prior_residual, self.prior_design
         return LinearMap(self.columns, self.design[rows], self.residual_m[rows], *priors), self.noise.of_rows(rows)
-
-    def mistake(self, columns: Array) -> EstimatedMistake:
-        """Estimate a mistake that changes what is measured by (c, m) ``columns`` times its m numbers.
-
-        Observations that it changes are taken into the equations, whether they take part or not.
-        """
-        rows = self.is_used | np.any(columns != 0, axis=1)
-        problem = self if np.array_equal(rows, self.is_used) else replace(self, is_used=rows)
-        return problem.solution.mistakes([-columns[rows]])[0]
 
     def posterior(self, *, formal: float | None = None, is_refined: bool = False) -> Posterior:
         """Return what the observations that are used say of the map.

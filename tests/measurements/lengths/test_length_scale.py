@@ -119,16 +119,16 @@ def test_a_mistyped_length_is_left_out_and_its_size_found(rng: np.random.Generat
     honest = located(path, 5, rng)
     found = scaled(replace(honest, distance_m=honest.distance_m + off_m * (np.arange(5) == 2)), path)
     np.testing.assert_array_equal(found.is_kept, np.arange(5) != 2)
-    assert found.too_long_m[2] == pytest.approx(off_m, abs=4 * found.stddev_m[2])
-    assert found.statistic[2] > found.threshold
+    assert found.errors[2].sizes[0] == pytest.approx(off_m, abs=4 * found.errors[2].stddevs[0])
+    assert found.errors[2].statistic > found.threshold
     assert found.alone.scale.value == pytest.approx(SCALE, rel=0.01)
 
 
 def test_nothing_checks_a_single_length(rng: np.random.Generator) -> None:
     path = walked(rng)
     found = scaled(located(path, 1, rng), path)
-    assert np.isinf(found.stddev_m[0])
-    assert found.statistic[0] == 0
+    assert np.isinf(found.errors[0].stddevs[0])
+    assert found.errors[0].statistic == 0
     assert found.is_kept.all()
 
 
@@ -140,12 +140,12 @@ def test_the_other_kinds_tell_whether_a_single_length_is_wrong(rng: np.random.Ge
     left_out = scaled(mistyped, path, [other("ranges"), other("positions")])
     assert not left_out.is_used
     assert len(known(with_lengths(mistyped, [left_out]))) == 0
-    assert left_out.too_long_m[0] == pytest.approx(0.09 * honest.distance_m[0], rel=0.2)
+    assert left_out.errors[0].sizes[0] == pytest.approx(0.09 * honest.distance_m[0], rel=0.2)
     assert scaled(mistyped, path, [other("ranges")]).is_used
     assert scaled(honest, path, [other("ranges"), other("positions", 0.09)]).is_used
     beside = scaled(honest, path, [other("ranges"), other("positions")])
     assert beside.alone.scale == scaled(honest, path).alone.scale
-    assert np.isfinite(beside.stddev_m[0])
+    assert np.isfinite(beside.errors[0].stddevs[0])
 
 
 def test_of_two_that_contradict_each_other_none_is_left_out_and_the_interval_says_so(rng: np.random.Generator) -> None:
@@ -194,9 +194,9 @@ def test_a_length_is_tested_against_what_the_others_predict(rng: np.random.Gener
     weights = (model / tape_m)[[0, 2]] ** 2
     variance = model[1] ** 2 / weights.sum() + tape_m[1] ** 2
     assert found.is_kept.all()
-    assert found.too_long_m[1] == pytest.approx(0.04, rel=0.01)
-    assert found.stddev_m[1] == pytest.approx(np.sqrt(variance), rel=0.01)
-    assert found.redundancy[1] == pytest.approx(tape_m[1] ** 2 / variance, rel=0.01)
+    assert found.errors[1].sizes[0] == pytest.approx(0.04, rel=0.01)
+    assert found.errors[1].stddevs[0] == pytest.approx(np.sqrt(variance), rel=0.01)
+    assert found.errors[1].redundancy == pytest.approx(tape_m[1] ** 2 / variance, rel=0.01)
 
 
 @pytest.mark.parametrize(

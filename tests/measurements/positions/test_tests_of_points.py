@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.mistakes import MistakeTests
 from rangesfm.solver.noise import Component
 from rangesfm.solver.posterior import Observations
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity

@@ -38,10 +38,10 @@ from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV,
 from rangesfm.measurements.imu.words import IMU, IMU_WORDS
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, fit_kinds
 from rangesfm.measurements.kind import Doubt, Measurements
+from rangesfm.measurements.mistakes import Mistake, MistakeTests, estimated
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.options import RefineOptions
 from rangesfm.solver.linear_map import Columns
-from rangesfm.solver.mistakes import MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS, Component
 from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
@@ -92,7 +92,8 @@ class InertialScale(KindOnMap):
         across = combinations.of(combinations.motion.errors.by_gravity @ self.state.horizontal)
         problem = replace(joined([observed], self.problem.bending), sizes=self.alone.problem.sizes)
         # The direction is that of the most likely state; how far off it may be is known as for a mistake in it.
-        stddev = float(np.linalg.norm(problem.mistake(across).stddevs)) / np.sqrt(2) / GRAVITY_M_S2
+        [found] = estimated(problem, [Mistake("direction of gravity", -across)])
+        stddev = float(np.linalg.norm(found.stddevs)) / np.sqrt(2) / GRAVITY_M_S2
         down = self.problem.path.world_from_cam[0].T @ self.state.gravity_m_s2
         return Gravity(-down / np.linalg.norm(down), stddev)
 

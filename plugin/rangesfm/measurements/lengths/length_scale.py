@@ -22,9 +22,15 @@ from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance
 from rangesfm.measurements.lengths.words import LENGTH_WORDS, LENGTHS
+from rangesfm.measurements.mistakes import (
+    FALSE_ALARM_RATE,
+    EstimatedMistake,
+    Mistake,
+    MistakeTest,
+    MistakeTests,
+    estimated,
+)
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
-from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, MistakeTests
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, SIGNIFICANT_STDDEVS
@@ -42,9 +48,7 @@ class LengthScale(KindOnMap):
         lengths: in the map. rows: (m,) of them among all distances. bending: of the map.
         is_kept: (m,) True for lengths that agree with all else; the others are not used. Where none is kept, the scale
             alone is that of all of them.
-        too_long_m, stddev_m: (m,) excess of each length over what all other kept measurements predict, and its standard
-            deviation; inf where nothing predicts it, and before a test.
-        redundancy: (m,) how much of an error of each length the others check, 0 to 1 (Baarda's redundancy number).
+        errors: (m,) of each length, by what all other kept measurements predict; empty before a test.
         taped: the m lengths as they were given.
     """
 
@@ -52,9 +56,7 @@ class LengthScale(KindOnMap):
     rows: Indices
     bending: MapBending
     is_kept: Mask
-    too_long_m: Array
-    stddev_m: Array
-    redundancy: Array
+    errors: tuple[EstimatedMistake, ...] = ()
     taped: tuple[TapedDistance, ...] = ()
 
     kind = LENGTHS
@@ -93,11 +95,6 @@ class LengthScale(KindOnMap):
     def threshold(self) -> float:
         """Squared error of a length, in standard deviations, above which it is an outlier."""
         return float(special.chdtri(1, FALSE_ALARM_RATE / len(self.rows)))
-
-    @property
-    def statistic(self) -> Array:
-        """(m,) squared excess of each length, in standard deviations."""
-        return (self.too_long_m / self.stddev_m) ** 2
 
     @property
     def by_metre(self) -> Array:
@@ -145,42 +142,35 @@ class LengthScale(KindOnMap):
         # Printed tags are shown only if something was found: their sides are many and alike.
         told = [row for row, one in zip(rows, self.taped, strict=True) if row.rejected or not one.is_printed]
         told.sort(key=lambda row: row.threshold - row.statistic)
-        return MistakeTests((*told, *against), reasons, tuple(self._hidden(against)))
+        return MistakeTests((*told, *against), reasons, tuple(self._hidden(rows, against)))
 
     def _tests_of_each(self) -> Iterator[MistakeTest]:
-        for k, one in enumerate(self.taped):
-            size_m, stddev_m = float(self.too_long_m[k]), float(self.stddev_m[k])
-            smallest_m = float(np.sqrt(noncentrality(1))) * stddev_m
-            is_known = np.isfinite(stddev_m)
-            between = f"{one.ends[0]} to {one.ends[1]}"
-            yield MistakeTest(
-                "length",
-                between,
-                float(self.statistic[k]),
-                self.threshold,
-                words=f"the length from {between} is given as {one.distance_m:.3f} m, but all else gives "
-                f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
-                remedy=_MEASURE_AGAIN,
-                unit="m",
-                size=size_m if is_known else np.nan,
-                stddev=stddev_m,
-                smallest_detectable=smallest_m,
-                effect_on_scale=abs(float(self.by_metre[k])) * smallest_m,
-                redundancy=float(self.redundancy[k]),
-                is_checked=bool(is_known),
+        """Yield the test of each length, with the effect of an error of it on the scale by the lengths."""
+        for found, by_metre in zip(self.errors, self.by_metre.tolist(), strict=True):
+            yield replace(found.row, effect_on_scale=abs(by_metre) * found.smallest_detectable)
+
+    def _hidden(self, rows: Sequence[MistakeTest], against: Sequence[MistakeTest]) -> Iterator[MistakeTest]:
+        """Yield mistakes that the tests may miss, of each length, and of all if they are compared with other kinds."""
+        yield from (row for row in rows if row.is_checked)
+        if compared := [row for row in against if np.isfinite(row.stddev)]:
+            yield min(compared, key=lambda row: row.stddev)
+        elif self._are_between_two_points or not all(row.is_checked for row in rows):
+            yield replace(rows[0], effect_on_scale=np.inf)
+
+    def _mistake(self, problem: JointProblem, k: int) -> Mistake:
+        """Return: a length is too long."""
+        columns = np.zeros((len(problem.is_used), 1))
+        columns[problem.rows[LENGTHS].start + k] = -1.0
+        between = f"{self.taped[k].ends[0]} to {self.taped[k].ends[1]}" if self.taped else ""
+        given_m = float(self.lengths.distance_m[k])
+
+        def words(size: Array) -> str:
+            return (
+                f"the length from {between} is given as {given_m:.3f} m, but all else gives {given_m - size[0]:.3f} m "
+                f"({number_text(float(size[0]), '+.3f')} m)"
             )
 
-    def _hidden(self, against: Sequence[MistakeTest]) -> Iterator[HiddenMistake]:
-        """Yield mistakes that the tests may miss, of each length, and of all if they are compared with other kinds."""
-        is_checked = np.isfinite(self.stddev_m)
-        for slope in (np.abs(self.by_metre) * self.stddev_m)[is_checked].tolist():
-            yield HiddenMistake("length", slope, self.threshold, 1, np.inf)
-        compared = [row.stddev for row in against if np.isfinite(row.stddev)]
-        if compared:
-            threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
-            yield HiddenMistake("lengths", min(compared), threshold, 1, np.inf)
-        elif self._are_between_two_points or not is_checked.all():
-            yield HiddenMistake("length", np.inf, np.inf, 1, np.inf)
+        return Mistake("length", columns, words, _MEASURE_AGAIN, subject=between)
 
     def tested(self, placed: Similarity, others: Sequence[Observations], *, is_last: bool = False) -> LengthScale:
         """Return the lengths with outlying ones left out; arguments as of ``KindOnMap.tested``."""
@@ -193,13 +183,8 @@ class LengthScale(KindOnMap):
                 most_unusual=SIGNIFICANT_STDDEVS, most_bent=SIGNIFICANT_STDDEVS
             )
 
-        def effect(of: JointProblem, k: int) -> Array:
-            columns = np.zeros((len(of.is_used), 1))
-            columns[of.rows[LENGTHS].start + k] = 1.0
-            return columns
-
         def among(of: JointProblem, k: int) -> float:
-            return of.mistake(effect(of, k)).statistic if of.is_used.any() else 0.0
+            return estimated(of, [self._mistake(of, k)])[0].statistic if of.is_used.any() else 0.0
 
         def against(kept: Mask, k: int) -> float:
             return among(problem(kept & (np.arange(num) != k)), k)
@@ -209,13 +194,13 @@ class LengthScale(KindOnMap):
             now = problem(kept)
             worst, statistic = most_contradicting(np.flatnonzero(kept), partial(among, now), partial(against, kept))
             # Where the others contradict each other, one of them is wrong.
-            wrong_size = (now.mistake(now.size_of(each.kind)).statistic for each in others)
-            if statistic <= max(self.threshold, *wrong_size, 0.0):
+            of_size = (estimated(now, [Mistake("size", _size_by(now, each.kind))])[0].statistic for each in others)
+            if statistic <= max(self.threshold, *of_size, 0.0):
                 break
             kept[worst] = False
         now = problem(kept)
-        too_long_m, stddev_m, redundancy = np.array([_test(now, effect(now, k)) for k in range(num)]).T
-        return replace(self, is_kept=kept, too_long_m=too_long_m, stddev_m=stddev_m, redundancy=redundancy)
+        errors = (found for k in range(num) for found in estimated(now, [self._mistake(now, k)]))
+        return replace(self, is_kept=kept, errors=tuple(replace(each, threshold=self.threshold) for each in errors))
 
 
 def lengths_between_points(
@@ -232,9 +217,9 @@ def lengths_between_points(
     rows = np.flatnonzero(distances.is_between_points & ~distances.is_check)
     if not len(rows):
         return None
-    lengths, nothing = _subset(distances, rows, bending.path), np.zeros(len(rows))
+    lengths, every = _subset(distances, rows, bending.path), np.ones(len(rows), dtype=bool)
     given = tuple(taped[row] for row in rows.tolist()) if taped else ()
-    return LengthScale(lengths, rows, bending, nothing == 0, nothing, nothing + np.inf, nothing, given)
+    return LengthScale(lengths, rows, bending, every, (), given)
 
 
 def _subset(distances: LocatedDistances, rows: Indices, path: Trajectory) -> LocatedDistances:
@@ -244,11 +229,8 @@ def _subset(distances: LocatedDistances, rows: Indices, path: Trajectory) -> Loc
     return distances.subset(np.isin(np.arange(len(distances)), rows))
 
 
-def _test(problem: JointProblem, columns: Array) -> tuple[float, float, float]:
-    """Return by how much a length is too long, the standard deviation of that, and the redundancy of the length."""
-    found = problem.mistake(columns)
-    if not found.is_seen or not np.isfinite(found.stddevs[0]):
-        return 0.0, np.inf, 0.0
-    rows = problem.is_used | np.any(columns != 0, axis=1)
-    seen = replace(problem, is_used=rows).solution.whitened(columns[rows])
-    return float(found.sizes[0]), float(found.stddevs[0]), found.redundancy_against(seen)
+def _size_by(problem: JointProblem, kind: str) -> Array:
+    """Return the column (c, 1) of a mistake by which all observations of a kind have the map too small."""
+    column = np.zeros((len(problem.is_used), 1))
+    column[problem.rows[kind], 0] = -problem.design[problem.rows[kind], problem.columns.scale]
+    return column

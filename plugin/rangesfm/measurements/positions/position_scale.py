@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,6 +16,15 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, join_kinds, most_contradicting
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.lengths.tape import CHECK, LEFT_OUT, Marker
+from rangesfm.measurements.mistakes import (
+    FALSE_ALARM_RATE,
+    Mistake,
+    MistakeTest,
+    MistakeTests,
+    estimated,
+    in_axes,
+    noncentrality,
+)
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
@@ -36,8 +45,7 @@ from rangesfm.measurements.positions.words import FRAME, POSITION_WORDS, POSITIO
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.options import LEVER_ARM_M, RefineOptions
 from rangesfm.solver.bending import MapBending
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, Columns, EstimatedMistake, noncentrality
-from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
+from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.moments import ByTime
@@ -56,19 +64,19 @@ _OF_ALL = ""  # subject of a test of all points
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
 # Words, remedy and unit of the mistakes of an antenna's positions.
-_OF_ANTENNA = {
+_OF_ANTENNA: dict[str, tuple[Callable[[Array], str], str, str]] = {
     _ARM: (
-        "the antenna sits elsewhere on the camera, by {} (right, down, forward)",
+        lambda size: f"the antenna sits elsewhere on the camera, by {in_axes(size)} (right, down, forward)",
         "measure from lens to antenna again ([positions] antenna_in_cam_m)",
         "m",
     ),
     _CLOCK: (
-        "the times of the positions are {} LATE",
+        lambda size: f"the times of the positions are {abs(size[0]):.2f} s {'late' if size[0] < 0 else 'early'}",
         "look for leap seconds, or let the offset be searched for ([positions] time_offset)",
         "s",
     ),
     _DATUM: (
-        "the positions and the control points have frames that are shifted by {}",
+        lambda size: f"the positions and the control points have frames that are shifted by {in_axes(size)}",
         "look which coordinate system and which height each of them has",
         "m",
     ),
@@ -185,7 +193,8 @@ class PositionScale(KindOnMap):
 
     def _statistic(self, row: int) -> float:
         """Return the squared error of a control point against all positions, in standard deviations."""
-        return self.alone.problem.mistake(self.columns_of(self.alone, at_point(self.known, row))).statistic
+        columns = self.columns_of(self.alone, at_point(self.known, row))
+        return estimated(self.alone.problem, [Mistake(_POINT, columns)])[0].statistic
 
     @property
     def places_map(self) -> bool:
@@ -274,8 +283,8 @@ class PositionScale(KindOnMap):
         return observed
 
     def columns_of(self, on_map: JointMap, of_positions: Array) -> Array:
-        """Return the columns (c, m) of a map's problem by those (3 k, m) of the positions."""
-        return on_map.columns(POSITIONS, self.grouped(on_map).grouping @ of_positions)
+        """Return the columns (c, m) of a mistake in a map's problem that makes the positions too large by (3 k, m)."""
+        return -on_map.columns(POSITIONS, self.grouped(on_map).grouping @ of_positions)
 
     @property
     def names_left_out(self) -> list[str]:
@@ -407,23 +416,25 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
         return []
     # The step to the estimate may turn a map about a straight path so far that points beside it do not move linearly.
     on_map = on_map.rejoined([each.moved(on_map.posterior) for each in on_map.kinds], on_map.estimate)
-    problem = on_map.problem
-    columns = {known.names[row]: positions.columns_of(on_map, at_point(known, row)) for row in marks}
+    by_name = {known.names[row]: positions.columns_of(on_map, at_point(known, row)) for row in marks}
     controls = {known.names[row] for row in marks if positions.is_kept[row]}
-    left_out = [name for name in columns if name in positions.names_left_out]
-    left = [name for name in columns if name not in left_out]
+    left_out = [name for name in by_name if name in positions.names_left_out]
+    left = [name for name in by_name if name not in left_out]
     if len(left) > 1 and any(each.places_map and each.is_used for each in on_map.kinds if each.kind != positions.kind):
-        columns[_OF_ALL] = np.sum([columns[name] for name in left], axis=0)
+        by_name[_OF_ALL] = np.sum([by_name[name] for name in left], axis=0)
         left.append(_OF_ALL)
-    rows = np.any(np.hstack([problem.is_used[:, None], *columns.values()]), axis=1)
-    (linear, noise), gains = problem.among(rows), on_map.posterior.gains
-    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / len(columns)))
+    used, gains = on_map.problem.is_used, on_map.posterior.gains
+    problem = replace(on_map.problem, is_used=np.any(np.hstack([used[:, None], *by_name.values()]), axis=1))
+    mistakes = {name: _of_point(positions, name, columns) for name, columns in by_name.items()}
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / len(mistakes)))
 
     def tested(some: Sequence[str], beside: Sequence[str]) -> list[MistakeTest]:
-        others = linear.with_more([columns[name][rows] for name in beside]).solved(noise.covariance_m2)
-        found = dict(zip(some, others.mistakes([-columns[name][rows] for name in some]), strict=True))
-        by_scale = {name: gains @ columns[name][problem.is_used] for name in some}
-        tests = (_of_point(positions, name, found[name], by_scale[name], threshold) for name in some)
+        tests = []
+        for found in estimated(problem, [mistakes[name] for name in some], [mistakes[name] for name in beside]):
+            by_scale = gains @ found.mistake.columns[used]
+            effect = np.linalg.norm(by_scale @ found.root) * np.sqrt(noncentrality(3)) if found.is_seen else np.inf
+            effect_on_scale = float(effect) if by_scale.any() else 0.0
+            tests.append(replace(replace(found, threshold=threshold).row, effect_on_scale=effect_on_scale))
         return sorted(tests, key=lambda test: -test.statistic)
 
     groups, beside = [tested([name], [other for other in left_out if other != name]) for name in left_out], [*left_out]
@@ -436,24 +447,28 @@ def _of_points(positions: PositionScale, on_map: JointMap) -> list[list[MistakeT
     return [*groups, *([test] for test in tests)]
 
 
-def _of_point(
-    positions: PositionScale, name: str, found: EstimatedMistake, by_scale: Array, threshold: float
-) -> MistakeTest:
-    """Return the test of a known point, or of the frame of all of them.
-
-    Args:
-        by_scale: (3,) change of the scale's logarithm per metre of the mistake.
-    """
-    effect = np.linalg.norm(by_scale @ found.root) * np.sqrt(noncentrality(3)) if found.is_seen else np.inf
-    found = replace(found, effect_on_log_scale=float(effect) if by_scale.any() else 0.0)
-    far, axes = f"{np.linalg.norm(found.sizes):.2f} m from", in_axes(-found.sizes)
+def _of_point(positions: PositionScale, name: str, columns: Array) -> Mistake:
+    """Return: a known point, or the frame of all of them, is elsewhere."""
     if name == _OF_ALL:
-        words = f"the map has all known points {far} their coordinates ({axes}), alike"
-        return row_of_mistake(_FRAME, name, found, threshold, words, _ONE_FRAME)
+        return Mistake(
+            _FRAME,
+            columns,
+            lambda size: (
+                f"the map has all known points {np.linalg.norm(size):.2f} m from their coordinates ({in_axes(-size)}), "
+                "alike"
+            ),
+            _ONE_FRAME,
+            subject=name,
+        )
     kinds = {point.name: point.kind for point in positions.surveyed.points.points}
     kind = _CHECK_POINT if kinds.get(name) == CHECK else _POINT
-    words = f"the {kind} {name} is {far} its coordinates ({axes})"
-    return row_of_mistake(kind, name, found, threshold, words, LOOK_AGAIN)
+    return Mistake(
+        kind,
+        columns,
+        lambda size: f"the {kind} {name} is {np.linalg.norm(size):.2f} m from its coordinates ({in_axes(-size)})",
+        LOOK_AGAIN,
+        subject=name,
+    )
 
 
 def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeTest]:
@@ -472,13 +487,11 @@ def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeT
     # Clocks that differ by more than the positions last have no moment in common.
     most = {_ARM: LEVER_ARM_M.most, _CLOCK: float(np.ptp(known.time_s[is_antenna]))}
     for name, of_all in columns.items():
-        by = of_all.reshape(3 * len(known), -1)
-        found = on_map.problem.learnt(in_problem := positions.columns_of(on_map, by)).mistake(in_problem)
-        threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
+        in_problem = positions.columns_of(on_map, of_all.reshape(3 * len(known), -1))
         words, remedy, unit = _OF_ANTENNA[name]
+        made = Mistake(name, in_problem, words, remedy, unit=unit)
+        [found] = estimated(on_map.problem.learnt(in_problem), [made])
+        threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
         if np.linalg.norm(found.sizes) > most.get(name, np.inf):
             found = replace(found, statistic=0.0)
-        said = words.format(in_axes(found.sizes) if len(found.sizes) == 3 else f"{abs(found.sizes[0]):.2f} s")
-        if name == _CLOCK:
-            said = said.replace("LATE", "late" if found.sizes[0] < 0 else "early")
-        yield row_of_mistake(name, "", found, threshold, said, remedy, unit)
+        yield replace(found, threshold=threshold).row

@@ -7,16 +7,16 @@ import pytest
 from tests.known import known
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.mistakes import Mistake
 from rangesfm.measurements.ranges.mistakes import alternatives as module
-from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 
 
-def places_of(found: Hypothesis) -> dict[str, list[float]]:
+def places_of(found: Mistake) -> dict[str, list[float]]:
     """Corrected places of anchors, rounded to a nanometre."""
     return {name: np.round(known(at), 9).tolist() for name, at in found.correction(np.zeros(0)).anchors_m.items()}
 
 
-def of_coordinates(given: dict[str, Array]) -> dict[str, Hypothesis]:
+def of_coordinates(given: dict[str, Array]) -> dict[str, Mistake]:
     return {each.words(np.zeros(0)): each for each in module._of_coordinates(given)}
 
 

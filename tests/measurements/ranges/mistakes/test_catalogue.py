@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.measurements.ranges.mistakes.test_linearized import ANCHORS_M, small_map
 
+from rangesfm.measurements.mistakes import Mistake
 from rangesfm.measurements.ranges.mistakes import catalogue
-from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 
@@ -26,12 +26,12 @@ def problem() -> Linearized:
     return linearized(placed_exactly())
 
 
-def all_standing(problem: Linearized) -> dict[tuple[str, str], Hypothesis]:
+def all_standing(problem: Linearized) -> dict[tuple[str, str], Mistake]:
     return {each.key: each for of_kind in catalogue.STANDING for each in of_kind(problem)}
 
 
 @pytest.fixture(scope="module")
-def standing(problem: Linearized) -> dict[tuple[str, str], Hypothesis]:
+def standing(problem: Linearized) -> dict[tuple[str, str], Mistake]:
     return all_standing(problem)
 
 
@@ -39,7 +39,7 @@ class TestTimes:
     """A radio may warm up, and clocks may differ, by amounts that can be."""
 
     def test_clocks_that_are_off_are_told_with_the_sign_of_the_offset(
-        self, standing: dict[tuple[str, str], Hypothesis]
+        self, standing: dict[tuple[str, str], Mistake]
     ) -> None:
         offset = standing["clock offset", ""]
         assert offset.words(np.array([-0.15])) == (

@@ -42,8 +42,8 @@ def test_a_mistake_beside_a_burst_is_found() -> None:
 
 def times_left_out_s(survey: MadeSurvey) -> Array:
     problem = linearized(known(run(survey, SEED).on_map))
-    hypotheses = [each for of_kind in STANDING for each in of_kind(problem)]
-    left = without_bursts(problem, hypotheses, hypotheses)
+    mistakes = [each for of_kind in STANDING for each in of_kind(problem)]
+    left = without_bursts(problem, mistakes, mistakes)
     bursts = [np.diag(each.alike) for each in left.components if each.name == BURSTS]
     return np.asarray(problem.bins.time_s[np.sum([*bursts, np.zeros(len(problem.bins))], axis=0) > 0])
 

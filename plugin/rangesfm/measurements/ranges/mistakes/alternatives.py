@@ -9,10 +9,9 @@ from itertools import combinations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.ranges.mistakes.hypothesis import (
+from rangesfm.measurements.mistakes import Correction, Mistake, in_axes
+from rangesfm.measurements.ranges.mistakes.effects import (
     MEASURE_AGAIN,
-    Correction,
-    Hypothesis,
     corrected,
     where_ranges_meet,
 )
@@ -27,7 +26,6 @@ from rangesfm.measurements.ranges.scale.range_equation import (
 )
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
-from rangesfm.solver.mistakes import in_axes
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
 
@@ -62,7 +60,7 @@ _IN_SITE = "x y z", "-x -y -z"
 _IN_CAMERA = "right down forward", "left up back"
 
 
-def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
+def alternatives(on_map: RangesOnMap) -> Iterator[Mistake]:
     """Yield all mistakes without a size that a map can have."""
     given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
@@ -71,7 +69,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     yield from _of_places(on_map, given)
     if on_map.posed.velocity is not None:  # as where the photos' order was taken from names that count down
         times = on_map.time_s
-        yield Hypothesis.without_size(
+        yield Mistake.without_size(
             "photos reversed",
             "",
             "the photos' times run backwards: the last photo has the time of the first",
@@ -81,7 +79,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Hypothesis]:
     yield from lever_arms_in_other_axes(on_map)
 
 
-def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Hypothesis]:
+def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Mistake]:
     """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
     in_cam_m = np.einsum("nji,nj->ni", on_map.posed.model_from_cam, on_map.problem.tag_from_center)
     tag_index = on_map.tag_index
@@ -91,39 +89,39 @@ def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Hypothesis]:
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
         if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
             remedy = "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)"
-            yield Hypothesis.without_size(
+            yield Mistake.without_size(
                 "lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves)
             )
 
 
-def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Hypothesis]:
+def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Mistake]:
     """Yield swapped pairs of anchors' labels (or of lines in their file), and coordinates shifted by one line."""
     remedy = "compare the labels on the devices with the anchors' file"
     for one, other in combinations(given, 2):
         words = f"the labels of anchors {one} and {other} are swapped"
         swapped = Correction({one: given[other], other: given[one]})
-        yield Hypothesis.without_size("labels swapped", f"{one}, {other}", words, remedy, swapped)
+        yield Mistake.without_size("labels swapped", f"{one}, {other}", words, remedy, swapped)
     at = [given[name] for name in names]
     for by, whose in ((1, "before"), (-1, "after")) if len(names) > 2 else ():
         words = f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file"
         shifted = Correction(dict(zip(names, at[by:] + at[:by], strict=True)))
-        yield Hypothesis.without_size("lines shifted", "", words, remedy, shifted)
+        yield Mistake.without_size("lines shifted", "", words, remedy, shifted)
 
 
-def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Hypothesis]:
+def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Mistake]:
     """Yield other axes of the anchors' coordinates, coordinates in feet, and ranges of the way there and back."""
     remedy = "compare the anchors' file with a sketch of the site"
     for axes_words, directions in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
         words, axes = f"in the anchors' coordinates {axes_words}", _turned(directions, *_IN_SITE)
         turned = Correction({name: axes @ at for name, at in given.items()})
-        yield Hypothesis.without_size("anchors' axes", "", words, remedy, turned)
+        yield Mistake.without_size("anchors' axes", "", words, remedy, turned)
     if len(given) < 2:
         return
     middle = np.mean(list(given.values()), axis=0)
     remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
     for words, metres in _UNITS_M.items():
         grown = Correction({name: middle + metres * (at - middle) for name, at in given.items()})
-        yield Hypothesis.without_size("anchors' unit", "", words, remedy, grown)
+        yield Mistake.without_size("anchors' unit", "", words, remedy, grown)
 
 
 def _turned(given: str, along: str, against: str) -> Array:
@@ -137,7 +135,7 @@ def _turned(given: str, along: str, against: str) -> Array:
     return np.column_stack([axes[direction] for direction in given.split()])
 
 
-def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Hypothesis]:
+def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Mistake]:
     """Yield for each anchor that hardly any range fits: it is far from its coordinates, as without a sign or a point.
 
     A linear test does not see this, as the ranges have no weight.
@@ -150,12 +148,12 @@ def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Hypo
                 f"anchor {name} is about {np.linalg.norm(off_m):.2f} m from where its coordinates say "
                 f"(by {in_axes(off_m)} in x, y, z)"
             )
-            yield Hypothesis.without_size("anchor place", name, words, MEASURE_AGAIN, Correction({name: None}))
+            yield Mistake.without_size("anchor place", name, words, MEASURE_AGAIN, Correction({name: None}))
 
 
 def best_refits(
-    on_map: RangesOnMap, scatter_m: float, tried: Sequence[Hypothesis], num_fitted: int
-) -> list[tuple[Hypothesis, RangesOnMap]]:
+    on_map: RangesOnMap, scatter_m: float, tried: Sequence[Mistake], num_fitted: int
+) -> list[tuple[Mistake, RangesOnMap]]:
     """Return mistakes with the map corrected for each and fitted to a few ranges of each anchor, the best fit first.
 
     Each fit starts from where the map itself sees the anchors.

@@ -1,4 +1,4 @@
-"""The catalogue of mistakes that last for the whole survey. Every hypothesis added here is tested and reported."""
+"""The catalogue of mistakes that last for the whole survey. Every mistake added here is tested and reported."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.ranges.mistakes.hypothesis import (
+from rangesfm.measurements.mistakes import Correction, Mistake, in_axes
+from rangesfm.measurements.ranges.mistakes.effects import (
     MEASURE_AGAIN,
-    Correction,
-    Hypothesis,
     duration_s,
     is_given,
     longest_m,
@@ -19,7 +18,6 @@ from rangesfm.measurements.ranges.mistakes.hypothesis import (
     too_long,
 )
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
-from rangesfm.solver.mistakes import in_axes
 
 SAME_HEIGHT_M = 1e-3
 """Nobody measures heights of anchors that agree to within this, metres."""
@@ -40,9 +38,9 @@ _MOST_WARMING_M = 5.0
 _MOST_BODY_M = 2.0
 
 
-def _lengthening(problem: Linearized, name: str, share: Array, **told: Any) -> Hypothesis:
+def _lengthening(problem: Linearized, name: str, share: Array, **told: Any) -> Mistake:
     """Return: ranges read too long by a size times a share (n,) of each; ``told``: further attributes."""
-    return Hypothesis(
+    return Mistake(
         name,
         -problem.bins.mean(share)[:, None],
         correction=lambda size: Correction(longer_m=size[0] * share),
@@ -51,12 +49,12 @@ def _lengthening(problem: Linearized, name: str, share: Array, **told: Any) -> H
     )
 
 
-def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
+def anchor_places(problem: Linearized) -> Iterator[Mistake]:
     """Yield for each given anchor: it is not where its coordinates say."""
     return (_anchor_place(problem, k) for k in problem.heard if is_given(problem, k))
 
 
-def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
+def _anchor_place(problem: Linearized, k: int) -> Mistake:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
     site = problem.on_map.posed.given.site
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
@@ -67,9 +65,9 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     def unknown(_: Array) -> Correction:
         return Correction({name: None})
 
-    def coordinate(axis: int) -> Hypothesis:
+    def coordinate(axis: int) -> Mistake:
         letter, direction = "xyz"[axis], np.eye(3)[axis]
-        return Hypothesis(
+        return Mistake(
             "anchor coordinate",
             of_anchor_place(problem, k, direction[:, None]),
             subject=f"{name} {letter}",
@@ -84,7 +82,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
             seen=seen[:, axis : axis + 1],
         )
 
-    return Hypothesis(
+    return Mistake(
         "anchor place",
         of_anchor_place(problem, k, np.eye(3)),
         subject=name,
@@ -97,19 +95,19 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
         most=most_m,
         adoption=unknown,
         max_unnoticed=UNSEEN_MOVE_M,
-        sub_hypotheses=tuple(map(coordinate, range(3))),
+        narrower=tuple(map(coordinate, range(3))),
         seen=seen,
     )
 
 
-def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
+def anchor_biases(problem: Linearized) -> Iterator[Mistake]:
     """Yield for each anchor and for all together: ranges have a constant error, larger than usual."""
     for k in problem.heard if len(problem.heard) > 1 else []:
         yield _bias(problem, [k], "anchor bias", problem.on_map.anchor_ids[k], f"anchor {problem.on_map.anchor_ids[k]}")
     yield _bias(problem, problem.heard, "common bias", "", "every anchor")
 
 
-def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Hypothesis:
+def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Mistake:
     return _lengthening(
         problem,
         kind,
@@ -122,10 +120,10 @@ def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whos
     )
 
 
-def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
+def range_shares(problem: Linearized) -> Iterator[Mistake]:
     """Yield for all ranges and for each anchor's: they grow by more or less than the distance does."""
     distance_m = problem.on_map.problem.range_m
-    yield Hypothesis(
+    yield Mistake(
         "range scale",
         -problem.gradient.distance_m[:, None],
         words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
@@ -140,7 +138,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
         yield _share_of_anchor(problem, k)
 
 
-def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
+def _share_of_anchor(problem: Linearized, k: int) -> Mistake:
     name, distance_m = problem.on_map.anchor_ids[k], problem.on_map.gradient.distance_m
     of_ranges, mean = (
         problem.on_map.problem.anchor_index == k,
@@ -166,14 +164,14 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
     )
 
 
-def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
+def anchors_in_another_scale(problem: Linearized) -> Iterator[Mistake]:
     """Yield: the anchors' coordinates are in a unit that is not quite the metre."""
     given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
     known = np.flatnonzero(np.isfinite(given_m).all(axis=1)).tolist()
     if len(known) < 2 or not any(is_given(problem, k) for k in known):
         return
     middle = given_m[known].mean(axis=0)
-    yield Hypothesis(
+    yield Mistake(
         "anchors' scale",
         np.sum(
             [of_anchor_place(problem, k, (given_m[k] - middle)[:, None]) for k in known if is_given(problem, k)], axis=0
@@ -191,14 +189,14 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
     )
 
 
-def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
+def heights_never_measured(problem: Linearized) -> Iterator[Mistake]:
     """Yield: the anchors were all given the same height, which is not true."""
     given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
     known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
     if len(known) < 3 or np.ptp(given_m[known, 2]) > SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
         return
     up, site = np.array([0.0, 0.0, 1.0]), problem.on_map.posed.given.site
-    yield Hypothesis(
+    yield Mistake(
         "anchor heights",
         np.hstack([of_anchor_place(problem, k, up[:, None]) for k in known]),
         words=lambda size: (
@@ -218,7 +216,7 @@ def to_other_side_m(lever_arm_m: float) -> float:
     return MISMEASURED_M + 2 * lever_arm_m
 
 
-def wrong_lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
+def wrong_lever_arms(problem: Linearized) -> Iterator[Mistake]:
     """Yield for each tag: it is elsewhere on the camera."""
     return (_lever_arm(problem, k) for k in np.unique(problem.bins.tag_index).tolist())
 
@@ -229,7 +227,7 @@ def lever_arm_m(problem: Linearized, tag: int) -> float:
     return float(np.median(arms_m[problem.on_map.tag_index == tag]))
 
 
-def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
+def _lever_arm(problem: Linearized, k: int) -> Mistake:
     on_map = problem.on_map
     name = on_map.tag_ids[k] if len(on_map.tag_ids) > 1 else ""
     length_m = lever_arm_m(problem, k)
@@ -241,7 +239,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
             what = f"the lever arm{of_tag} is off by {far}"
         return f"{what} ({in_axes(size)} along the camera's x, y, z)"
 
-    return Hypothesis(
+    return Mistake(
         "lever arm",
         np.where((problem.bins.tag_index == k)[:, None], -problem.by_lever_arm, 0.0),
         subject=name,
@@ -253,7 +251,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
     )
 
 
-def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
+def radios_warming(problem: Linearized) -> Iterator[Mistake]:
     """Yield: the radio's delay changes steadily, by more than radios drift."""
     since = problem.on_map.time_s - problem.time_s.mean()
     lasts, unit = float(np.ptp(since)), "m of the path" if problem.on_map.posed.velocity is None else "s"
@@ -272,7 +270,7 @@ def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
     )
 
 
-def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
+def people_in_between(problem: Linearized) -> Iterator[Mistake]:
     """Yield: a person who carries the camera blocks the signals of anchors behind."""
     on_map = problem.on_map
     is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
@@ -287,7 +285,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     )
 
 
-def clocks(problem: Linearized) -> Iterator[Hypothesis]:
+def clocks(problem: Linearized) -> Iterator[Mistake]:
     """Yield: the offset or the rate between the clocks of camera and radio differs from what is assumed."""
     if problem.on_map.posed.velocity is None:
         return
@@ -297,7 +295,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         "film sharp turns at the beginning and the end, or let the offset be searched for, if you gave it "
         "(ranges_time_offset auto)"
     )
-    yield Hypothesis(
+    yield Mistake(
         "clock offset",
         -by_time[:, None],
         words=lambda size: f"the time offset between the clocks is wrong: it needs about {size[0]:+.2f} s more",
@@ -306,7 +304,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
         most=duration_s(problem),
         unit="s",
     )
-    yield Hypothesis(
+    yield Mistake(
         "clock drift",
         -(by_time * since)[:, None],
         words=lambda size: (
@@ -319,7 +317,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
 
 
-STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+STANDING: tuple[Callable[[Linearized], Iterator[Mistake]], ...] = (
     anchor_places,
     anchor_biases,
     range_shares,

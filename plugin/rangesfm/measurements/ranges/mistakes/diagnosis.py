@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.arrays import Indices
 from rangesfm.measurements.mistake_words import mistake_in_words
+from rangesfm.measurements.mistakes import EstimatedMistake, MistakeTest, MistakeTests
 from rangesfm.measurements.ranges.mistakes.alternatives import LEAST_USED
 from rangesfm.measurements.ranges.mistakes.bent_path import drifts
 from rangesfm.measurements.ranges.mistakes.find_mistakes import Cause, Findings, find_mistakes
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Test, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized, near_m
 from rangesfm.measurements.ranges.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
-from rangesfm.solver.mistakes import MistakeTest, MistakeTests
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.util.processes.threads import with_one_blas_thread
 
@@ -37,37 +36,17 @@ _MIXED_UP = "anchor mixed up"
 _OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
 
 
-@dataclass(frozen=True)
-class Diagnosis(MistakeTests):
-    """The tests of a map and the mistakes that they found; without reasons, at most one that could stay hidden.
-
-    Attributes:
-        causes: the likeliest cause in the ranges, and those that cannot be told from it.
-        rows: (n,) rows of the log to which the corrections refer.
-    """
-
-    causes: tuple[Cause, ...] = ()
-    rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    def with_more(self, more: MistakeTests) -> Diagnosis:
-        """Return the verdict with tests of another kind added."""
-        tests = (*more.tests, *self.tests)
-        reasons, hidden = (*self.reasons, *more.reasons), (*self.hidden, *more.hidden)
-        likeliest, of_place = self.likeliest or more.likeliest, (*self.of_place, *more.of_place)
-        causes, rows = (more.causes, more.rows) if isinstance(more, Diagnosis) else (self.causes, self.rows)
-        return Diagnosis(tests, reasons, hidden, likeliest, of_place, causes, rows)
-
-
 @with_one_blas_thread
-def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
+def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> MistakeTests:
     """Test for all mistakes that ranges on a map can show."""
     found = find_mistakes(on_map, seed=seed)
     shown = list(_evidence(found.problem))
     before = _before_causes(found, shown)
     seen = [row for row in shown if row.rejected and row not in before]
-    named = {cause.hypothesis.key for cause in found.causes}
-    others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
-    rows = (*before, *map(_row_of_cause, found.causes), *seen, *others, *(row for row in shown if not row.rejected))
+    named = {cause.mistake.key for cause in found.causes}
+    others = (test.row for test in found.tests if test.mistake.key not in named)
+    causes = (_row_of_cause(cause, on_map.posed.rows) for cause in found.causes)
+    rows = (*before, *causes, *seen, *others, *(row for row in shown if not row.rejected))
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *seen)]
     likeliest = causes_in_words(found.causes) if found.causes else ""
     if likeliest:
@@ -76,7 +55,7 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     # The map is elsewhere, too, if the anchors are.
     moves = any(cause.correction.anchors_m for cause in found.causes)
     of_place = (likeliest,) if moves else ()
-    return Diagnosis(rows, said, found.hidden, likeliest, of_place, found.causes, on_map.posed.rows)
+    return MistakeTests(rows, said, found.hidden, likeliest, of_place)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
@@ -104,36 +83,38 @@ def causes_in_words(causes: Sequence[Cause]) -> str:
     """Return the likeliest cause with its remedy as a sentence; causes that cannot be told apart are all named."""
     sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
     if len(causes) == 1:
-        return f"probably {causes[0].words} ({sure}): {causes[0].hypothesis.remedy}"
+        return f"probably {causes[0].words} ({sure}): {causes[0].mistake.remedy}"
     either = ", or ".join(cause.words for cause in causes)
-    remedies = dict.fromkeys(cause.hypothesis.remedy for cause in causes)
+    remedies = dict.fromkeys(cause.mistake.remedy for cause in causes)
     return f"either {either} ({sure}; the ranges do not tell which): {'; or '.join(remedies)}"
 
 
 def _what_could_hide(found: Findings) -> Iterator[str]:
     """Yield the worst mistake that could stay hidden, if it changes the scale by more than a good scale may be off."""
-    hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
+    hidden = [t for t in found.tests if not t.mistake.is_in_interval and np.isfinite(t.effect_on_log_scale)]
     worst = max(hidden, key=_hidden_effect, default=None)
     if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
-        size = min(worst.smallest_detectable, worst.hypothesis.most_unnoticed)
+        size = min(worst.smallest_detectable, worst.mistake.most_unnoticed)
         change = f"change the scale by {100 * _hidden_effect(worst):.1f} %"
         yield (
-            f"the ranges cannot show every mistake that matters: an error of {size:.2g} {worst.hypothesis.unit} "
-            f"({mistake_in_words(*worst.hypothesis.key)}) would go unnoticed and {change}; tape a length between two "
-            f"distant points as a check, or {worst.hypothesis.remedy}"
+            f"the ranges cannot show every mistake that matters: an error of {size:.2g} {worst.mistake.unit} "
+            f"({mistake_in_words(*worst.mistake.key)}) would go unnoticed and {change}; tape a length between two "
+            f"distant points as a check, or {worst.mistake.remedy}"
         )
 
 
-def _hidden_effect(test: Test) -> float:
+def _hidden_effect(test: EstimatedMistake) -> float:
     """Return the change of the scale's logarithm by the largest mistake that neither test nor surveyor would notice."""
-    return test.effect_on_log_scale * min(1.0, test.hypothesis.most_unnoticed / test.smallest_detectable)
+    return test.effect_on_log_scale * min(1.0, test.mistake.most_unnoticed / test.smallest_detectable)
 
 
-def _row_of_cause(cause: Cause) -> MistakeTest:
-    """Return the row of a cause, with the statistic by which it was found."""
-    if cause.test is None:
-        return MistakeTest(*cause.hypothesis.key, cause.gain, cause.penalty, cause.words, cause.hypothesis.remedy)
-    return row_of(replace(cause.test, statistic=_statistic(cause)))
+def _row_of_cause(cause: Cause, rows: Indices) -> MistakeTest:
+    """Return the row of a cause, with the statistic by which it was found; ``rows``: of the ranges in the log."""
+    correction = replace(cause.correction, rows=rows)
+    if cause.test is not None:
+        return replace(replace(cause.test, statistic=_statistic(cause)).row, correction=correction)
+    remedy = cause.mistake.remedy
+    return MistakeTest(*cause.mistake.key, cause.gain, cause.penalty, cause.words, remedy, correction=correction)
 
 
 def _statistic(cause: Cause) -> float:

@@ -14,20 +14,20 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Indices
+from rangesfm.measurements.mistakes import FALSE_ALARM_RATE, Mistake
 from rangesfm.measurements.ranges.errors.components import BURSTS, LASTING_S
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
-from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis, longest_m
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import estimates
+from rangesfm.measurements.ranges.mistakes.effects import longest_m
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE
+from rangesfm.measurements.ranges.mistakes.thresholds import estimates
 from rangesfm.solver.noise import Component
 
 # Most bursts that are left out. More of them are no exception, and are seen as noise.
 _MAX_NUM_BURSTS = 8
 
 
-def without_bursts(problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]) -> Linearized:
-    """Leave out the bursts that explain the residuals better than any hypothesis.
+def without_bursts(problem: Linearized, standing: Sequence[Mistake], mistakes: Sequence[Mistake]) -> Linearized:
+    """Leave out the bursts that explain the residuals better than any mistake.
 
     Their ranges may then err by as much as a range can. The errors are learnt while the standing mistakes explain what
     they can.
@@ -45,7 +45,7 @@ def without_bursts(problem: Linearized, standing: Sequence[Hypothesis], hypothes
         best = int(np.argmax(statistics))
         if statistics[best] < threshold:
             break
-        possible = (test for test in estimates(problem, hypotheses) if test.is_possible)
+        possible = (test for test in estimates(problem, mistakes) if test.is_possible)
         likeliest = max((test.statistic - test.penalty(num) for test in possible), default=0.0)
         if statistics[best] - float(np.log(num)) < likeliest:
             break

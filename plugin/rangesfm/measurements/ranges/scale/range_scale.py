@@ -13,10 +13,11 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import BentMap, JointMap, KindOnMap, join_kinds
 from rangesfm.measurements.kind import Block, Doubt
+from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
 from rangesfm.measurements.ranges.mistakes.bent_path import AnchorSides, bends_m, bent_to_ranges, drifts, likelier_sides
-from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.diagnosis import diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import linearized
 from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
 from rangesfm.measurements.ranges.scale.binned_ranges import BinnedRanges, binned_ranges, moved, shared_errors_m
@@ -203,7 +204,7 @@ class RangeScale(KindOnMap):
         doubts = tuple(doubts_of_ranges(solved, known.uncertainty, {}))
         yield BentMap(replace(self, told=told), bent.metric_from_path, known, doubts, remarks)
 
-    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> Diagnosis:
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
         """Return the tests of all mistakes that ranges can show."""
         del by_kind
         return diagnose_ranges(self.on(on_map), seed=self.solved.posed.given.seed)

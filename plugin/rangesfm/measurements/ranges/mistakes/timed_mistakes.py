@@ -9,10 +9,9 @@ from functools import partial
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.measurements.mistakes import Correction, Mistake, in_axes
 from rangesfm.measurements.ranges.mistakes.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
-from rangesfm.measurements.ranges.mistakes.hypothesis import (
-    Correction,
-    Hypothesis,
+from rangesfm.measurements.ranges.mistakes.effects import (
     duration_s,
     longer,
     longest_m,
@@ -20,7 +19,6 @@ from rangesfm.measurements.ranges.mistakes.hypothesis import (
 )
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions
-from rangesfm.solver.mistakes import in_axes
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
 _NUM_TIMES, _NUM_FINER = 32, 17
@@ -58,7 +56,7 @@ _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
 }
 
 
-def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
+def anchors_moved(problem: Linearized) -> Iterator[Mistake]:
     """Yield for each anchor: it was moved at some time."""
     for k in problem.heard:
         # The anchor must be within reach before and after.
@@ -66,7 +64,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
         yield from _elsewhere(problem, [k], name, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
 
 
-def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
+def map_breaks(problem: Linearized) -> Iterator[Mistake]:
     """Yield: after some time the map is elsewhere, as after a wrong match."""
     # Two parts of a map cannot be farther apart than the map is large.
     tags_m = antenna_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
@@ -74,7 +72,7 @@ def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     return _elsewhere(problem, _all(problem), "", "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
 
 
-def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
+def tags_slipped(problem: Linearized) -> Iterator[Mistake]:
     """Yield: after some time the tag is elsewhere on the camera."""
     on_map = problem.on_map
     # The tag is still on the camera.
@@ -91,7 +89,7 @@ def _elsewhere(
     most_m: float,
     axes: Callable[[], Array],
     by_shift: Array,
-) -> Iterator[Hypothesis]:
+) -> Iterator[Mistake]:
     """Yield moves at unknown times, relative to some anchors.
 
     Args:
@@ -106,8 +104,8 @@ def _elsewhere(
         grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
         return Correction(longer_m=np.where(later(), grown_m, 0.0))
 
-    def moved(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
-        return Hypothesis(
+    def moved(when: str, later: Callable[[], Mask], after: Array) -> Mistake:
+        return Mistake(
             name,
             -after[:, None] * by_shift,
             subject=whose,
@@ -122,19 +120,19 @@ def _elsewhere(
     return _changes(problem, anchors, 3 * _MIN_NUM_BINS, moved)
 
 
-def steps(problem: Linearized) -> Iterator[Hypothesis]:
+def steps(problem: Linearized) -> Iterator[Mistake]:
     """Yield: after some time the ranges of one anchor, or of all, read longer or shorter."""
     for name, anchors in _each_and_all(problem):
         yield from _steps(problem, name, anchors)
 
 
-def _steps(problem: Linearized, name: str, anchors: Sequence[int]) -> Iterator[Hypothesis]:
+def _steps(problem: Linearized, name: str, anchors: Sequence[int]) -> Iterator[Mistake]:
     def words(when: str, size: Array) -> str:
         to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
         return f"the ranges{to} jumped {when}: since then they read about {abs(size[0]):.2f} m {how}"
 
-    def step(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
-        return Hypothesis(
+    def step(when: str, later: Callable[[], Mask], after: Array) -> Mistake:
+        return Mistake(
             "anchor step" if name else "step",
             -after[:, None],
             subject=name,
@@ -148,7 +146,7 @@ def _steps(problem: Linearized, name: str, anchors: Sequence[int]) -> Iterator[H
     return _changes(problem, anchors, _MIN_NUM_BINS, step)
 
 
-def stretches(problem: Linearized) -> Iterator[Hypothesis]:
+def stretches(problem: Linearized) -> Iterator[Mistake]:
     """Yield: for some time the ranges of one anchor, or of all, read longer or shorter."""
     windows = list(_windows(problem))
 
@@ -162,7 +160,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
             if inside.sum() < _MIN_NUM_BINS:
                 continue
             within = partial(_later, problem, anchors, start, end)
-            yield Hypothesis(
+            yield Mistake(
                 "anchor stretch" if name else "stretch",
                 -inside[:, None],
                 subject=name,
@@ -175,14 +173,14 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
             )
 
 
-def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
+def clock_jumps(problem: Linearized) -> Iterator[Mistake]:
     """Yield: the clocks' offset jumped at some time."""
     if problem.on_map.posed.velocity is None:
         return iter(())
     by_time = problem.bins.mean(problem.on_map.by_time)
 
-    def jump(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
-        return Hypothesis(
+    def jump(when: str, later: Callable[[], Mask], after: Array) -> Mistake:
+        return Mistake(
             "clock jump",
             -(by_time * after)[:, None],
             words=lambda size: f"the clocks' offset jumped {when}, by about {size[0]:+.2f} s",
@@ -221,20 +219,20 @@ def _changes(
     problem: Linearized,
     anchors: Sequence[int],
     least: int,
-    change: Callable[[str, Callable[[], Mask], Array], Hypothesis],
-) -> Iterator[Hypothesis]:
+    change: Callable[[str, Callable[[], Mask], Array], Mistake],
+) -> Iterator[Mistake]:
     """Yield a change of some anchors at times away from the ends of the survey.
 
     Args:
         least: fewest bins before and after.
-        change: returns the hypothesis, given words for its time, a function that returns the later ranges, and (c,)
+        change: returns the mistake, given words for its time, a function that returns the later ranges, and (c,)
             shares of the bins that are later.
     """
     of_anchors = np.isin(problem.on_map.problem.anchor_index, anchors)
     is_of = np.isin(problem.bins.anchor_index, anchors)
     shares = np.linspace(_LEAST_SHARE, 1 - _LEAST_SHARE, _NUM_TIMES)
 
-    def at(times: Array) -> Iterator[Hypothesis]:
+    def at(times: Array) -> Iterator[Mistake]:
         for k, (time, share) in enumerate(zip(times.tolist(), _shares_after(problem, times), strict=True)):
             after = np.where(is_of, share, 0.0)
             if min(after.sum(), is_of.sum() - after.sum()) >= least:
@@ -271,7 +269,7 @@ def _when(problem: Linearized, start: float, end: float = np.inf) -> str:
     return f"{span} {what}"
 
 
-SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+SCANNING: tuple[Callable[[Linearized], Iterator[Mistake]], ...] = (
     anchors_moved,
     map_breaks,
     tags_slipped,

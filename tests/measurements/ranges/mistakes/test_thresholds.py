@@ -1,4 +1,4 @@
-"""Tests of hypotheses: their statistic, their power, and the rate of false alarms of all together."""
+"""Tests of mistakes: their statistic, their power, and the rate of false alarms of all together."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tests.simulated.runs import run
 from tests.simulated.surveys import SITES, surveyed
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.ranges.mistakes import hypothesis_tests
+from rangesfm.measurements.mistakes import FALSE_ALARM_RATE, Correction, Mistake, noncentrality
+from rangesfm.measurements.ranges.mistakes import thresholds as module
 from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.effects import at_size
 from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
-from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Hypothesis
-from rangesfm.measurements.ranges.mistakes.hypothesis_tests import judged, overlap, row_of
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
-from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
-from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.measurements.ranges.mistakes.thresholds import judged, overlap
+from rangesfm.measurements.ranges.mistakes.timed_mistakes import SCANNING
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def problem() -> Linearized:
     return find_mistakes(on_map).problem
 
 
-def hypotheses(problem: Linearized) -> list[Hypothesis]:
+def possible_mistakes(problem: Linearized) -> list[Mistake]:
     return [each for of_kind in (*STANDING, *SCANNING) for each in of_kind(problem)]
 
 
@@ -47,7 +47,7 @@ def without_noise(problem: Linearized) -> Linearized:
 
 def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> None:
     silent = without_noise(problem)
-    for each in hypotheses(problem):
+    for each in possible_mistakes(problem):
         size = np.arange(1.0, each.num + 1)
         made = with_mistake(silent, each.columns @ size)
         [test] = judged(made, [each], 0)
@@ -57,7 +57,7 @@ def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> No
 
 def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem: Linearized) -> None:
     silent = without_noise(problem)
-    for each in hypotheses(problem):
+    for each in possible_mistakes(problem):
         [test] = judged(silent, [each], 0)
         if each.num == 1 and np.isfinite(test.smallest_detectable):
             size = np.array([test.smallest_detectable])
@@ -70,21 +70,21 @@ def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem
 
 def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(problem: Linearized) -> None:
     silent = without_noise(problem)
-    for each in hypotheses(problem):
+    for each in possible_mistakes(problem):
         direction = -np.arange(1.0, each.num + 1) / np.linalg.norm(np.arange(1.0, each.num + 1))
         for share in (0.5, 1.5):
             size = share * each.most * direction
             made = with_mistake(silent, each.columns @ size)
             [test] = judged(made, [each], 0)
             if np.isfinite(test.smallest_detectable):
-                told = row_of(test).size
+                told = test.row.size
                 signed = -share * each.most if each.num == 1 else share * each.most
                 # Impossible sizes are not reported.
                 assert told == pytest.approx(signed if share < 1 else np.nan, rel=1e-4, nan_ok=True)
 
 
-def test_hypotheses_that_explain_nearly_the_same_overlap_and_others_do_not(problem: Linearized) -> None:
-    of_key = {each.key: each for each in hypotheses(problem)}
+def test_mistakes_that_explain_nearly_the_same_overlap_and_others_do_not(problem: Linearized) -> None:
+    of_key = {each.key: each for each in possible_mistakes(problem)}
     bias, drift = of_key["common bias", ""], of_key["radio drift", ""]
     both = replace(bias, columns=bias.columns + 0.1 * drift.columns)
     tests = judged(without_noise(problem), [bias, both, drift], 0)
@@ -94,13 +94,13 @@ def test_hypotheses_that_explain_nearly_the_same_overlap_and_others_do_not(probl
 
 
 def test_the_effect_of_a_large_mistake_is_that_at_its_size(problem: Linearized) -> None:
-    bias = next(each for each in hypotheses(problem) if each.key == ("common bias", ""))
+    bias = next(each for each in possible_mistakes(problem) if each.key == ("common bias", ""))
     num = len(problem.on_map.problem.range_m)
     squared = replace(bias, correction=lambda size: Correction(longer_m=np.full(num, size[0] ** 2)))
-    found = squared.at_size(problem, np.array([3.0]))
+    found = at_size(squared, problem, np.array([3.0]))
     np.testing.assert_allclose(found.columns, 6 * bias.columns, rtol=1e-3)
     turned = replace(bias, correction=lambda _: Correction(tag_moves_m={}))
-    assert turned.at_size(problem, np.array([3.0])) is turned  # its effect is found on the map that it moves
+    assert at_size(turned, problem, np.array([3.0])) is turned  # its effect is found on the map that it moves
 
 
 def test_baardas_number() -> None:
@@ -112,10 +112,10 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
     problem: Linearized, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng, num = np.random.default_rng(1), 150
-    factor, tried = np.linalg.cholesky(problem.noise.covariance_m2), hypotheses(problem)
+    factor, tried = np.linalg.cholesky(problem.noise.covariance_m2), possible_mistakes(problem)
     thresholds = np.array([test.threshold for test in judged(problem, tried, 0)])
     # The thresholds do not depend on the measurements, and they are most of the work.
-    monkeypatch.setattr(hypothesis_tests, "_thresholds", lambda *_: thresholds)
+    monkeypatch.setattr(module, "_thresholds", lambda *_: thresholds)
     alarms = 0
     for _ in range(num):
         num_priors = len(problem.prior_residual)
@@ -141,7 +141,7 @@ def test_thresholds_are_exceeded_in_2_percent_of_the_surveys_by_any_of_the_tests
     nums: list[int], together: int, num_independent: int
 ) -> None:
     """The right threshold is exceeded by 20 +- 4.5 of 1000 draws."""
-    found = hypothesis_tests._thresholds(bases_of(nums, together), np.array(nums), 0)
+    found = module._thresholds(bases_of(nums, together), np.array(nums), 0)
     p_values = [stats.chi2.sf(most, num) for most, num in zip(found, nums, strict=True) if num]
     np.testing.assert_allclose(p_values, p_values[0])  # all tests are as significant
     rate = 1 - (1 - p_values[0]) ** num_independent

@@ -1,20 +1,21 @@
-"""Hypothesis: one possible mistake, its effect on the residuals, its texts and its correction."""
+"""What possible mistakes in ranges have in common: their effects on the residuals, limits, and corrections."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Mask
+from rangesfm.measurements.mistakes import Correction, Mistake
 from rangesfm.measurements.ranges.anchors.point_fit import multilaterate
 from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.measurements.ranges.scale.range_equation import antenna_positions
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.util.geometry.numerics import ROUNDING
 
-# Step, in the unit of a hypothesis, of the difference quotient for its effect: then rounding and curvature spoil it by
+# Step, in the unit of a mistake, of the difference quotient for its effect: then rounding and curvature spoil it by
 # about the same.
 _SMALL = np.sqrt(ROUNDING)
 
@@ -22,94 +23,14 @@ MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates
 """Remedy for an anchor that is not where its coordinates say."""
 
 
-@dataclass(frozen=True)
-class Correction:
-    """Changes of the input that undo a mistake.
-
-    Attributes:
-        anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown, and is where its ranges meet.
-        tag_moves_m: (3,) additions to lever arms in the camera's frame, by tag id.
-        time_shift_s: addition to the times of the ranges, one for all or (n,).
-        left_out: rows of ranges that are not used.
-        longer_m: amount by which the ranges are too long, one for all or (n,).
-    """
-
-    anchors_m: Mapping[str, Array | None] = field(default_factory=dict)
-    tag_moves_m: Mapping[str, Array] = field(default_factory=dict)
-    time_shift_s: float | Array = 0.0
-    left_out: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    longer_m: float | Array = 0.0
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A mistake described by k numbers; by none, if it has no size and is tried as a whole.
-
-    Attributes:
-        name: of its kind. subject: which one of the kind, such as an anchor's id; may be empty.
-        columns: (c, k) derivatives by these of the residuals of the bins, metres per unit; or (c + r, k), with those of
-            the residuals of the priors below them, in standard deviations per unit.
-        words: returns for an estimate (k,) what is probably the case.
-        remedy: what to measure or to change.
-        correction: returns for an estimate the changes that undo the mistake.
-        most: largest possible size, as the length of the vector of numbers. A larger estimate is not this mistake.
-        unit: of the numbers.
-        adoption: returns the changes to make if the mistake is adopted; None: those of ``correction``.
-        max_unnoticed: a mistake larger than this is noticed without a test, so it need not be feared.
-        refine_time: returns the same mistake at times between those that are searched; nothing if it has no time.
-        sub_hypotheses: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
-        is_linear: whether one step finds its size, however large it is.
-        seen: (c, k) effect on the ranges if the map was known, where that differs from ``columns``: an error of an
-            anchor's coordinates is an effect on their prior.
-        is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
-    """
-
-    name: str
-    columns: Array
-    words: Callable[[Array], str]
-    remedy: str
-    correction: Callable[[Array], Correction]
-    most: float
-    subject: str = ""
-    unit: str = "m"
-    adoption: Callable[[Array], Correction] | None = None
-    max_unnoticed: float = np.inf
-    refine_time: Callable[[], Iterable[Hypothesis]] = tuple
-    sub_hypotheses: tuple[Hypothesis, ...] = ()
-    is_linear: bool = False
-    is_in_interval: bool = False
-    seen: Array | None = None
-
-    @classmethod
-    def without_size(cls, name: str, subject: str, words: str, remedy: str, correction: Correction) -> Hypothesis:
-        """Return a mistake that is tried as a whole."""
-        return cls(name, np.zeros((0, 0)), lambda _: words, remedy, lambda _: correction, 0.0, subject)
-
-    def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
-        """Return the hypothesis with its effect linearised about an estimate, as large mistakes are not linear."""
-        longer_m = self.correction(sizes).longer_m
-        if not np.any(longer_m):
-            return self
-        steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
-        slopes = [(step - longer_m) / _SMALL for step in steps]
-        return replace(self, columns=-problem.bins.mean(np.stack(slopes, axis=1)))
-
-    def can_be(self, sizes: Array) -> bool:
-        """Return True if a mistake of this size (k,) is possible."""
-        return bool(np.linalg.norm(sizes) <= self.most)
-
-    @property
-    def most_unnoticed(self) -> float:
-        """Largest possible size that nobody notices without a test."""
-        return min(self.most, self.max_unnoticed)
-
-    @property
-    def num(self) -> int:
-        return int(self.columns.shape[1])
-
-    @property
-    def key(self) -> tuple[str, str]:
-        return self.name, self.subject
+def at_size(mistake: Mistake, problem: Linearized, sizes: Array) -> Mistake:
+    """Return a mistake with its effect linearised about an estimate, as large mistakes are not linear."""
+    longer_m = mistake.correction(sizes).longer_m
+    if not np.any(longer_m):
+        return mistake
+    steps = [mistake.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
+    slopes = [(step - longer_m) / _SMALL for step in steps]
+    return replace(mistake, columns=-problem.bins.mean(np.stack(slopes, axis=1)))
 
 
 def is_given(problem: Linearized, anchor: int) -> bool:
