@@ -115,7 +115,9 @@ def scene() -> Scene:
         ),
         "gravity": UpwardDirection(Gravity(poses.world_from_rig[0].T @ [0.0, 0.6, 0.8], 0.05)),
         "prior": Prior(
-            (("bias", "A0"), ("bias", "A1"), ("bias", "A2")), rng.normal(0, 0.1, (3, 1)), rng.normal(0, 5, (3, 3))
+            ((("bias", "A0"), ("bias", "A1"), ("bias", "A2")),),
+            rng.normal(0, 0.1, (1, 3, 1)),
+            rng.normal(0, 5, (1, 3, 3)),
         ),
         "inertial": motions,
         "bias walk": [*motions.priors()][-1],

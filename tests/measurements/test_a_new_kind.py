@@ -57,7 +57,7 @@ class Steps(KindOnMap):
         return fit_kinds((self,), self.start, self.at.bending)
 
     def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
-        num, nothing = len(self.distance_m), np.zeros(0, dtype=np.int64)
+        num = len(self.distance_m)
         predicted_m = placed.scale * np.linalg.norm(self.away, axis=1)
         along = self.away / np.linalg.norm(self.away, axis=1)[:, None]
         by_pose, rows = np.zeros((num, num + 1, 6)), np.arange(num)
@@ -66,7 +66,7 @@ class Steps(KindOnMap):
         noise_m2 = STEPS_STDDEV_M**2 * np.eye(num)
         return Observations(
             kind=STEPS,
-            columns=Columns(0, -1, nothing, nothing, 1),
+            columns=Columns.of_whole(1),
             design=predicted_m[:, None],
             residual_m=predicted_m - self.distance_m,
             by_pose=by_pose.reshape(num, -1),

@@ -22,6 +22,9 @@ from rangesfm.util.geometry.trajectory import pose_of
 Array = npt.NDArray[np.float64]
 STEP = 1e-5
 
+BROUGHT_BY = {"prior": "range", "bias walk": "inertial"}
+"""What brings the blocks of a prior into a problem."""
+
 
 def difference(kind: Measurements, at: Callable[[float], MapState]) -> Array:
     plus, minus = (kind.linearize(at(sign * STEP)).residual for sign in (1, -1))
@@ -74,8 +77,8 @@ def test_the_compiled_cost_is_that_of_the_weights(name: str, scene: Scene) -> No
     blocks = {block: at.copy() for block, at in scene.state.blocks.items()}
     blocks |= {("mark", mark): model.point3D(id_).xyz for mark, id_ in ids.items()}
     poses = [pose_of(model.frame(int(frame_id))).params for frame_id in scene.path.frame_ids]
-    if name == "prior":  # of blocks that something else has brought into the problem
-        scene.kinds["range"].add_to(adjustment, poses, blocks)
+    if name in BROUGHT_BY:
+        scene.kinds[BROUGHT_BY[name]].add_to(adjustment, poses, blocks)
     first = adjustment.adjuster.problem.num_residuals()
     kind.add_to(adjustment, poses, blocks)
     residuals = np.asarray(adjustment.adjuster.problem.evaluate_residuals())[first:] / adjustment.pixel_stddev

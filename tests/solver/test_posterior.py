@@ -16,7 +16,7 @@ from rangesfm.solver.noise import Component, learnt_sizes, noise_of_sizes
 from rangesfm.solver.posterior import JointProblem, Observations, joined
 from rangesfm.util.geometry.trajectory import Trajectory
 
-NUM_POSES, NONE = 4, np.zeros(0, dtype=np.int64)
+NUM_POSES = 4
 PATH = Trajectory(
     np.arange(NUM_POSES),
     tuple("abcd"),
@@ -42,7 +42,7 @@ class Shaken:
 def kind(name: str, num: int, seed: int, noise: float, *, is_placed: bool = True, shared: float = 0.0) -> Observations:
     """Draw observations with independent and shared errors; a kind that is not placed depends on the scale alone."""
     rng = np.random.default_rng(seed)
-    columns = Columns(0, 1, NONE, NONE, 7) if is_placed else Columns(0, -1, NONE, NONE, 1)
+    columns = Columns.of_whole(7 if is_placed else 1)
     own, alike = noise**2 * np.eye(num), shared**2 * np.ones((num, num))
     return Observations(
         columns,

@@ -221,7 +221,7 @@ class _Terms:
 
 
 def _rows(linear: Linearization, roots: Array, graph: KeyframeGraph) -> sparse.csr_array:
-    """Return the derivatives of g groups of d residuals, times (g, d, d) roots, as (g d, num_free) sparse rows."""
+    """Return the derivatives of g groups of d residuals, times (g, r, d) roots, as (g r, num_free) sparse rows."""
     num, size = linear.residual.shape
     columns = [(6 * linear.pose[:, :, None] + np.arange(6)).reshape(num, -1)]
     derivatives = [linear.by_pose.reshape(num, size, -1)]
@@ -232,8 +232,8 @@ def _rows(linear: Linearization, roots: Array, graph: KeyframeGraph) -> sparse.c
         derivatives.append(np.where(by.index[:, None, None] >= 0, by.values, 0.0))
     values = roots @ np.concatenate(derivatives, axis=2)
     indices = np.broadcast_to(np.concatenate(columns, axis=1)[:, None], values.shape)
-    starts = values.shape[2] * np.arange(num * size + 1)
-    shape = (num * size, int(graph.starts[-1]))
+    starts = values.shape[2] * np.arange(num * values.shape[1] + 1)
+    shape = (num * values.shape[1], int(graph.starts[-1]))
     return sparse.csr_array((values.ravel(), indices.ravel(), starts), shape=shape)[:, graph.free]
 
 

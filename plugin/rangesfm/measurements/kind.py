@@ -83,7 +83,7 @@ class Weights:
     """How much each of g groups of d residuals counts (section 4): half of ``share * loss(|root_information @ e|^2)``.
 
     Attributes:
-        root_information: (g, d, d) inverse root of the covariance.
+        root_information: (g, r, d) inverse root of the covariance, or any root of the information.
         share: (g,) number of independent groups that each counts as.
         loss: of the length of a group in standard deviations; least squares if its width is infinite.
     """
@@ -93,7 +93,7 @@ class Weights:
     loss: RobustLoss
 
     def whitened(self, residual: Array) -> Array:
-        """Return (g, d) residuals in standard deviations."""
+        """Return (g, r) numbers in standard deviations, given the (g, d) residuals."""
         return np.asarray(np.einsum("gij,gj->gi", self.root_information, residual))
 
 

@@ -208,8 +208,7 @@ def expect(
 
 
 def _keyframes(path: Trajectory, num: int, *, in_site: bool) -> Observations:
-    some, nothing = _some(len(path), num), np.zeros(0, dtype=np.int64)
-    columns = Columns(0, 1, nothing, nothing, 7) if in_site else Columns(0, -1, nothing, nothing, 1)
+    some, columns = _some(len(path), num), Columns.of_whole(7 if in_site else 1)
     motions = similarity_motions(path.centers[some] - path.centers[0]).reshape(-1, 7)
     none, by_pose = np.zeros(len(motions)), _by_pose(some, len(path))
     return Observations(

@@ -26,6 +26,12 @@ class Columns:
     bias: Indices
     num: int
 
+    @classmethod
+    def of_whole(cls, num: int) -> Columns:
+        """Return those of the map as a whole alone: the logarithm of the scale, and the frame if there are 7."""
+        nothing = np.zeros(0, dtype=np.int64)
+        return cls(0, 1 if num == 7 else -1, nothing, nothing, num)
+
     @property
     def of_map(self) -> list[int]:
         """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""

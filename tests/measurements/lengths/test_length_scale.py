@@ -85,10 +85,9 @@ def scaled(
 
 def other(kind: str, longer: float = 0.0, stddev: float = 0.01) -> Observations:
     """Another kind of measurement, by which the map is larger than it is."""
-    nothing, one = np.zeros(0, dtype=np.int64), np.array([[stddev**2]])
-    columns, used = Columns(0, -1, nothing, nothing, 1), np.ones(1, dtype=bool)
+    one, used = np.array([[stddev**2]]), np.ones(1, dtype=bool)
     return Observations(
-        columns,
+        Columns.of_whole(1),
         np.ones((1, 1)),
         np.array([-longer]),
         kind=kind,

@@ -44,9 +44,9 @@ class Held(KindOnMap):
         assert in_site, "it places the map"
         assert max_num > 7
         turn, first_m = Rotation.from_matrix(placed.rotation).as_rotvec(), PATH.centers[:1]
-        none, covariance = np.zeros(0, dtype=np.int64), self.stddev**2 * np.eye(7)
+        covariance = self.stddev**2 * np.eye(7)
         return Observations(
-            Columns(0, 1, none, none, 7),
+            Columns.of_whole(7),
             np.eye(7),
             np.array([np.log(placed.scale), *turn, *(placed.apply(first_m) - first_m)[0]]),
             kind=self.kind,

@@ -89,7 +89,7 @@ class InertialMotions(Measurements):
         yield Prior.of_one(MOUNTING, place, np.repeat([known.turn_rad, known.arm_m], 3))
         yield GravityLength()
         if len(self.walk_stddev):
-            yield BiasWalk(self._biases, self.walk_stddev)
+            yield Prior.of_walk(self._biases, self.walk_stddev)
 
     @property
     def _root_information(self) -> Array:
@@ -170,37 +170,6 @@ class InertialMotions(Measurements):
 
     def log_likelihood(self, residual: Array) -> float:
         return -residual.size * float(np.log(max(self._shown(residual, 0.0), 1e-300)))
-
-
-@dataclass(frozen=True)
-class BiasWalk(Measurements):
-    """Random walk of the biases from one stretch of time to the next.
-
-    Attributes:
-        names: of the blocks (6,), s of them. stddev: (s - 1, 6) of each change.
-    """
-
-    kind: ClassVar[str] = "bias_walk"
-
-    names: tuple[Block, ...]
-    stddev: Array
-
-    @property
-    def weights(self) -> Weights:
-        return Weights(1 / self.stddev[:, None] * np.eye(6), np.ones(len(self.stddev)), LEAST_SQUARES)
-
-    def linearize(self, state: MapState) -> Linearization:
-        rows, one = np.arange(len(self.stddev)), np.tile(np.eye(6), (len(self.stddev), 1, 1))
-        changes = np.diff([state.blocks[name] for name in self.names], axis=0)
-        by_block = (ByBlock(self.names, rows, -one), ByBlock(self.names, rows + 1, one))
-        return Linearization.without_poses(changes, by_block)
-
-    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> None:
-        for k, root in enumerate(self.weights.root_information):
-            cost = solver.joint_prior_cost(
-                mean=np.zeros((2, 6)), whitening=adjustment.pixel_stddev * np.hstack([-root, root])
-            )
-            solver.add_residual_block(adjustment.adjuster, cost, None, [blocks[name] for name in self.names[k : k + 2]])
 
 
 @dataclass(frozen=True)

@@ -187,14 +187,14 @@ class InertialScale(KindOnMap):
         """Return the observations that are made of all errors."""
         problem, motion, state = self.problem, made.motion, made.motion.state
         by_pose = made.by_photos(motion.errors.by_pose, len(problem.path))
-        of_shared, nothing = made.of(motion.shared), np.zeros(0, dtype=np.int64)
+        of_shared = made.of(motion.shared)
         components = tuple(self._components(made, by_pose, of_shared))
         known = [each.alike for each in components if each.spread == 0]
         assumed = [self.sizes[each.name] ** 2 * each.alike for each in components if each.name in self.sizes]
         covariance = np.asarray(np.sum([*known, *assumed], axis=0))
         return Observations(
             kind=IMU,
-            columns=Columns(0, -1, nothing, nothing, 1),
+            columns=Columns.of_whole(1),
             design=of_shared[:, SCALE],
             # Constant errors of the sensor are about what was known of it before.
             residual_m=made.of(motion.errors.residual) - of_shared @ problem.off_prior(state),

@@ -27,7 +27,7 @@ def lengths_on_map(lengths: LocatedDistances, scale: float, num_poses: int, is_u
         scale: metres per unit of that model. num_poses: of the path.
         is_used: (m,) lengths that take part.
     """
-    num, nothing = len(lengths), np.zeros(0, dtype=np.int64)
+    num = len(lengths)
     grown_m, printed = scale * lengths.model_length, lengths.is_printed
     # Sides of printed tags share the error of their size.
     alone = ~(printed[:, None] & printed) & ~np.eye(num, dtype=bool)
@@ -35,7 +35,7 @@ def lengths_on_map(lengths: LocatedDistances, scale: float, num_poses: int, is_u
     marks_m2 = np.diag((scale * lengths.mark_stddev) ** 2)
     return Observations(
         kind=LENGTHS,
-        columns=Columns(0, -1, nothing, nothing, 1),
+        columns=Columns.of_whole(1),
         design=grown_m[:, None],
         residual_m=grown_m - lengths.distance_m,
         by_pose=scale * csr_array(lengths.by_pose, shape=(num, 6 * num_poses)).toarray(),

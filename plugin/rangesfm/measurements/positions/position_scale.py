@@ -217,10 +217,9 @@ class PositionScale(KindOnMap):
         design = grouping @ design_of_positions(known, similarity, self.bending.path)
         variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
         weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
-        nothing = np.zeros(0, dtype=np.int64)
         return GroupedPositions(
             kind=POSITIONS,
-            columns=Columns(0, 1, nothing, nothing, 7),
+            columns=Columns.of_whole(7),
             design=design,
             residual_m=grouping @ known.misclosures_m(similarity).ravel(),
             by_pose=groups_by_pose(known, similarity, grouping),

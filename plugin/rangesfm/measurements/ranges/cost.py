@@ -127,9 +127,9 @@ class Ranges(Measurements):
             # One joint prior, because the biases share that of the tag.
             own_m = np.array([each.prior_bias_stddev_m for each in drawn])
             yield Prior(
-                tuple(("bias", each.anchor_id) for each in drawn),
-                np.array([[each.prior_bias_m] for each in drawn]),
-                bias_whitening(own_m, self.errors.common_bias_stddev_m),
+                (tuple(("bias", each.anchor_id) for each in drawn),),
+                np.array([[[each.prior_bias_m] for each in drawn]]),
+                bias_whitening(own_m, self.errors.common_bias_stddev_m)[None],
             )
         if self.options.lever_arm_stddev_m > 0:
             for name, arm_m in zip(self._arm_names, self.tags_in_cam_m, strict=True):
