@@ -273,3 +273,62 @@ class TestContent:
         for frame in read_model(tmp_path).frames.values():
             assert frame.rig_from_world is not None
             assert np.linalg.norm(frame.rig_from_world.params[:4]) == pytest.approx(1, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "new", "said"),
+    [
+        ("cameras.txt", r"^2 OPENCV", "2 OPENCW", "cameras.txt:5: is '2 OPENCW 1024 768 "),
+        ("cameras.txt", r"^(2 OPENCV .*) \S+$", r"\1", "cameras.txt:5: is '2 OPENCV 1024 768 "),
+        ("cameras.txt", r"^2 .*\n", "", "rigs.txt:4: rig 1 names camera 2, which is not in cameras.txt"),
+        ("cameras.txt", r"\A", "\ufeff", "cameras.txt:1: begins with a byte order mark"),
+        ("points3D.txt", r"^(3 \S+) .*$", r"\1", "points3D.txt:6: is '3 "),
+        ("points3D.txt", r"^3 \S+", "3 nan", "points3D.txt:6: is '3 nan "),
+        ("points3D.txt", r"^(3(?: \S+){7}) \d+", r"\1 99", "points3D.txt:6: point 3 names image 99, which is not in "),
+        ("points3D.txt", r"^(3 .*) \d+\s*$", r"\1 9999\n", "points3D.txt:6: point 3 names feature 9999 of image "),
+        ("points3D.txt", r"^(3 .*)$", r"\1\n\1", "points3D.txt:7: point 3 is in line 6 already"),
+        ("images.txt", r"^2((?: \S+){7}) \d+", r"2\1 77", "images.txt:7: image 2 names camera 77, which is not in "),
+        ("images.txt", r"^2((?: \S+){7} \d+ )", r"1\1", "images.txt:7: image 1 is in line 5 already"),
+        ("frames.txt", r"^2 \d+", "2 9", "frames.txt:5: frame 2 names rig 9, which is not in rigs.txt"),
+        ("frames.txt", r"^2 .*\n", "", "is in no frame of frames.txt"),
+        ("rigs.txt", r"^1 .*$", "1 2 X", "rigs.txt:4: is '1 2 X', expected RIG_ID NUM_SENSORS and the sensors"),
+    ],
+)
+def test_a_fault_in_a_text_model_is_said_with_its_file_and_line(
+    name: str, pattern: str, new: str, said: str, rigs: Path, tmp_path: Path
+) -> None:
+    read_model(rigs).write_text(tmp_path)
+    text = (tmp_path / name).read_text(encoding="utf-8")
+    changed = re.sub(pattern, new, text, count=1, flags=re.MULTILINE)
+    assert changed != text
+    (tmp_path / name).write_text(changed, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_model(tmp_path)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "said"),
+    [
+        ("cameras.bin", 12, "cameras.bin: record 1: camera {} has the model 77, which COLMAP does not know"),
+        ("images.bin", 8 + 60, "images.bin: record 1: image {} names camera 77, which is not in cameras.bin"),
+        ("frames.bin", 8 + 4, "frames.bin: record 1: frame {} names rig 77, which is not in rigs.bin"),
+    ],
+)
+def test_a_fault_in_a_binary_model_is_said_with_its_file_and_record(
+    name: str, at: int, said: str, rigs: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(rigs, tmp_path / "model")
+    data = bytearray((folder / name).read_bytes())
+    data[at : at + 4] = (77).to_bytes(4, "little")
+    (folder / name).write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        read_model(folder)
+    assert said.format(int.from_bytes(data[8:12], "little")) in str(caught.value)
+
+
+def test_rigs_without_frames_are_named(rigs: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(rigs, tmp_path / "model")
+    (folder / "frames.bin").unlink()
+    with pytest.raises(InputError, match=r"there is rigs\.bin without frames\.bin"):
+        read_model(folder)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from tests.fuzz.mutation import mutated
 
-from rangesfm.colmap.model_files import NUM_CAMERA_PARAMS
+from rangesfm.colmap.model_faults import NUM_CAMERA_PARAMS
 
 TEXT = "text"
 _EXTREMES: dict[str, tuple[float | bytes, ...]] = {

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 if TYPE_CHECKING:
@@ -20,6 +21,12 @@ def joined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_fact
     flags = (*walked_survey.flags, "--anchors", "anchors.csv", "--max_relative_stddev", "0.1", "--quiet")
     rangesfm_command("scale", *flags, "--output_path", folder / "left", cwd=walked_survey.folder)
     shutil.copytree(folder / "left", folder / "right")
+    header, *rows = (folder / "right" / "ranges.csv").read_text().splitlines()
+    column, rng = header.split(",").index("range_m"), np.random.default_rng(7)
+    of_its_own_tag = [row.split(",") for row in rows]
+    for row, noise_m in zip(of_its_own_tag, rng.normal(0, 0.02, len(rows)), strict=True):
+        row[column] = f"{float(row[column]) + noise_m:.6f}"
+    (folder / "right" / "ranges.csv").write_text("\n".join([header, *map(",".join, of_its_own_tag)]) + "\n")
     anchors = (walked_survey.folder / "anchors.csv").read_text()
     assert "A1,1006.0," in anchors
     (folder / "anchors.csv").write_text(anchors.replace("A1,1006.0,", "A1,1007.0,"))

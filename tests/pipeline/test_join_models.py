@@ -303,6 +303,18 @@ def test_surveys_of_two_days_become_one_map(
     assert (tmp_path / "site" / "report.html").is_file()
 
 
+def test_a_copy_of_a_survey_does_not_count_twice(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(finished / "monday" / "out", tmp_path / "copy")
+    monkeypatch.chdir(finished)
+    folders = ("monday/out", "tuesday/out", str(tmp_path / "copy"))
+    assert main(["join", *folders, "--output_path", str(tmp_path / "site")]) == 2
+    said = f"rangesfm: error: {tmp_path / 'copy'}: has the photos and ranges of monday/out: expected each survey once"
+    assert capsys.readouterr().err.splitlines()[-1] == said
+    assert not (tmp_path / "site").exists()
+
+
 def test_a_survey_that_nothing_holds_is_refused_in_one_line_and_leaves_nothing(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

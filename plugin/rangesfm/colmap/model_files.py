@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from rangesfm.colmap.model_faults import NUM_CAMERA_PARAMS, refuse_fault
 from rangesfm.errors import InputError
 from rangesfm.util.files.atomic import is_plain_name
 from rangesfm.util.files.contents import open_regular
@@ -26,12 +27,6 @@ from rangesfm.util.geometry.reference import read_reference
 
 MAX_COORDINATE = 1e12
 """Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""
-
-NUM_CAMERA_PARAMS = {
-    int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
-    for name, model in pycolmap.CameraModelId.__members__.items()
-    if name != "INVALID"
-}
 
 _NO_POINT = 2**64 - 1
 _COUNT_BYTES = 8
@@ -75,6 +70,10 @@ class Records:
         """Return the groups of all records, one after the other, decoded as ``dtype``."""
         joined = b"".join([self.data[start:end] for start, end in zip(self.groups_start, self.end, strict=True)])
         return np.frombuffer(joined, dtype)
+
+    def each(self) -> list[bytes]:
+        """Return the bytes of each record (n,)."""
+        return [self.data[start:end] for start, end in zip(self.start, self.end, strict=True)]
 
     def num_groups(self, dtype: np.dtype[np.void]) -> npt.NDArray[np.int64]:
         """Return the number of groups of each record (n,)."""
@@ -194,6 +193,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     try:
         model = _read_text_model(path) if is_text else pycolmap.Reconstruction(path)
     except (OSError, ValueError, RuntimeError, LookupError, MemoryError) as error:
+        refuse_fault(path, ".txt" if is_text else ".bin", lambda file: records[file.name].each())
         raise InputError(f"not a readable COLMAP model, {_EXPECTED}", path) from error
     _check_names(model, path)
     _check_cameras(model, path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,8 @@ from rangesfm.util.processes.threads import at_most, with_one_blas_thread
 
 # In metres. The files of two surveys may round the position of the same anchor differently.
 _SAME_PLACE_M = 1e-3
+# Largest share of one survey's ranges that another may have by chance.
+_MAX_SHARED = 0.5
 
 
 @dataclass(frozen=True)
@@ -67,18 +70,32 @@ class FinishedRun:
         arms = self.result.lever_arms_m(list(self.tag_ids))
         return dict(zip(self.tag_ids.values(), arms, strict=True))
 
+    @property
+    def measured(self) -> set[tuple[object, ...]]:
+        """What tells a survey from others, as it was measured: each range of a photo, with its time, tag and anchor."""
+        ranges = self.ranges
+        moments = [name or time_s for name, time_s in zip(ranges.image_name, ranges.timestamp_s.tolist(), strict=True)]
+        columns = (ranges.keyframe_before, moments, ranges.tag_id, ranges.anchor_id, ranges.range_m.tolist())
+        return {row for row in zip(*columns, strict=True) if row[0]}
+
 
 def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
     """Read result folders. Where photos or tags of two surveys have the same name, the name of the survey is added.
 
     Raises:
-        InputError: there are fewer than two folders, one is given twice, one has no ranges or models, or only some have
-            times.
+        InputError: there are fewer than two folders, one survey is given twice, one has no ranges or models, or only
+            some have times.
     """
     if len(folders) < 2:
         raise InputError(f"{len(folders)} result folder is given, expected two or more to join")
     results = [read_result_folder(folder) for folder in folders]
     surveys = [_read(name, result) for name, result in zip(_names(folders), results, strict=True)]
+    for one, other in combinations(surveys, 2):
+        if len(one.measured & other.measured) > _MAX_SHARED * min(len(one.measured), len(other.measured)):
+            raise InputError(
+                f"has the photos and ranges of {one.result.output_path}: expected each survey once",
+                other.result.output_path,
+            )
     timed = [survey for survey in surveys if survey.path.timestamps_s is not None]
     if timed and len(timed) < len(surveys):
         bare = next(survey for survey in surveys if survey.path.timestamps_s is None)

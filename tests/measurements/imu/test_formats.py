@@ -119,6 +119,34 @@ def degrees_and_g(folder: Path) -> Path:
     return written(folder / "imu.csv", ",".join(["time_us", *names]), columns)
 
 
+def milli_g(folder: Path) -> Path:
+    names = [*(f"acc_{axis}_mg" for axis in "xyz"), *(f"gyr_{axis}_mdps" for axis in "xyz")]
+    columns = [LOG.timestamp_s * 1e3, *1e3 * LOG.accel_m_s2.T / G_M_S2, *1e3 * np.degrees(LOG.gyro_rad_s).T]
+    return written(folder / "imu.csv", ",".join(["timestamp_ms", *names]), columns)
+
+
+def milli_g_without_units(folder: Path) -> Path:
+    columns = [LOG.timestamp_s, *1e3 * LOG.accel_m_s2.T / G_M_S2, *LOG.gyro_rad_s.T]
+    return written(folder / "imu.csv", "time_s,ax,ay,az,gx,gy,gz", columns)
+
+
+def german(folder: Path) -> Path:
+    names = [*(f"Beschleunigung {axis} [mg]" for axis in "XYZ"), *(f"Drehrate {axis} [°/s]" for axis in "XYZ")]
+    columns = [LOG.timestamp_s, *1e3 * LOG.accel_m_s2.T / G_M_S2, *np.degrees(LOG.gyro_rad_s).T]
+    path = written(folder / "imu.csv", ";".join(["Zeit [s]", *names]), columns, ";")
+    path.write_text(path.read_text(encoding="utf-8").replace(".", ","), encoding="cp1252")
+    return path
+
+
+def french(folder: Path) -> Path:
+    names = [
+        *(f"Accélération {axis} (m/s²)" for axis in "xyz"),
+        *(f"Vitesse angulaire {axis} (rad/s)" for axis in "xyz"),
+    ]
+    columns = [LOG.timestamp_s, *LOG.accel_m_s2.T, *LOG.gyro_rad_s.T]
+    return written(folder / "imu.csv", ",".join(["Temps (s)", *names]), columns)
+
+
 def phone(folder: Path, *, platform: str, accel: dict[str, Array]) -> Path:
     """Write a recording of Sensor Logger: a file for each sensor, z before y and x, accelerations later than rates."""
     folder = folder / "2026-09-22_10-00-00"
@@ -215,6 +243,7 @@ def bag(folder: Path) -> Path:
 
 FORMATS = (
     *(canonical, euroc, euroc_without_header, kalibr, inrol, mars_since_boot, physics_toolbox, androsensor, rostopic),
+    *(milli_g, milli_g_without_units, german, french),
     *(degrees_and_g, android, ios, ios_uncalibrated, zipped, phyphox, gopro, bag),
 )
 

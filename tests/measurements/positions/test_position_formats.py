@@ -144,6 +144,11 @@ def test_pose_priors_of_a_database_are_positions_of_its_photos(tmp_path: Path, s
         ("timestamp_s,x_m,y_m,z_m\n", {}, "holds no position (read as table)"),
         ("timestamp_s,x_m,y_m,z_m\n1,2,three,4\n", {}, "positions.txt:2: y_m is 'three', expected"),
         ("timestamp_s,x_m,y_m,z_m,stddev_m\n1,2,3,4,-1\n", {}, "positions.txt:2: stddev_m is -1, expected"),
+        (
+            "image_name,x_m,y_m,z_m\na.jpg,1,2,3\nb.jpg,2,2,3\na.jpg,9,2,3\n",
+            {},
+            "positions.txt:4: photo a.jpg is in line 2 already, expected each once",
+        ),
         ("1 2 3\n", {"format": "rtk"}, "unknown format of positions 'rtk'; the nearest is 'rtklib'"),
         ("1 2 3\n", {"format": "rtklib"}, "has no header row of an RTKLIB solution"),
     ],

@@ -320,15 +320,16 @@ def _chosen_gyro(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _S
     if not candidates:
         raise InputError(f"there is no gyroscope in it, {_EXPECTED}", path)
     gyro = _rising(candidates[0], notes)
+    gyro = replace(gyro, values=gyro.values * _RAD_S[gyro.unit])
     # Faster turns than sensors measure are degrees, whatever the name of the column says.
-    too_fast = bool(np.abs(gyro.values).max(initial=0.0) > _FASTEST_RAD_S)
-    if gyro.unit != "deg" and too_fast:
+    too_fast = gyro.unit in ("", "rad") and bool(np.abs(gyro.values).max(initial=0.0) > _FASTEST_RAD_S)
+    if too_fast:
         notes.append(f"{gyro.path.name}: {gyro.name} are taken as degrees a second, by their size")
     elif not gyro.unit:
         notes.append(
             f"{gyro.path.name}: {gyro.name} have no unit and are taken as rad/s; the photos' turns will show it"
         )
-    return replace(gyro, values=np.radians(gyro.values)) if gyro.unit == "deg" or too_fast else gyro
+    return replace(gyro, values=np.radians(gyro.values)) if too_fast else gyro
 
 
 def _chosen_accel(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _Signal:
@@ -346,8 +347,8 @@ def _chosen_accel(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _
                 notes.append(
                     f"{one.path.name}: {one.name} are in {_UNIT[unit]} by their length, whatever the name says"
                 )
-            elif not one.unit and unit == "g":
-                notes.append(f"{one.path.name}: {one.name} are taken as g, by their length")
+            elif not one.unit and unit != "m":
+                notes.append(f"{one.path.name}: {one.name} are taken as {_UNIT[unit]}, by their length")
             return _in_metres(_rising(one, notes), unit)
     if (gravity := next((one for one in signals if one.kind == GRAVITY), None)) is not None:
         unit_of_gravity = _unit_of_accel(gravity)
@@ -366,7 +367,10 @@ def _chosen_accel(signals: Sequence[_Signal], path: Path, notes: list[str]) -> _
     )
 
 
-_UNIT = {"m": "m/s^2", "g": "g"}
+# By unit of ``Triple``: rates of turn in rad/s; its name, and the length of gravity in it.
+_RAD_S = {"": 1.0, "rad": 1.0, "mrad": 1e-3, "deg": np.radians(1.0), "mdeg": np.radians(1e-3)}
+_UNIT = {"m": "m/s^2", "g": "g", "mg": "mg (thousandths of g)"}
+_GRAVITY = {"m": STANDARD_GRAVITY_M_S2, "g": 1.0, "mg": 1000.0}
 
 
 def _unit_of_accel(signal: _Signal) -> str | None:
@@ -375,7 +379,7 @@ def _unit_of_accel(signal: _Signal) -> str | None:
     if not len(lengths):
         return None
     low, middle, high = np.percentile(lengths, [25, 50, 75])
-    for unit, gravity in (("m", STANDARD_GRAVITY_M_S2), ("g", 1.0)):
+    for unit, gravity in _GRAVITY.items():
         # Without gravity, walking has accelerations of 1 m/s^2 as well, but of all lengths.
         is_such = signal.unit == unit or high - low < _STEADY * middle
         if _WITH_GRAVITY[0] < middle / gravity < _WITH_GRAVITY[1] and is_such:
@@ -384,7 +388,7 @@ def _unit_of_accel(signal: _Signal) -> str | None:
 
 
 def _in_metres(signal: _Signal, unit: str) -> _Signal:
-    return replace(signal, values=signal.values * STANDARD_GRAVITY_M_S2) if unit == "g" else signal
+    return replace(signal, values=signal.values * (STANDARD_GRAVITY_M_S2 / _GRAVITY[unit]))
 
 
 def _rising(signal: _Signal, notes: list[str]) -> _Signal:

@@ -17,12 +17,18 @@ def _words(text: str) -> frozenset[str]:
 
 
 _OF_SENSOR = {
-    GRAVITY: _words("gravity grav"),
-    GYRO: _words("gyro gyroscope gyr angular omega w rotation rate gy"),
-    ACCEL: _words("accel accelerometer acc acceleration a alpha force gf f"),
+    GRAVITY: _words("gravity grav schwerkraft gravité gravedad gravità"),
+    GYRO: _words(
+        "gyro gyroscope gyr angular omega w rotation rate gy gyroskop kreisel drehrate drehraten "
+        "winkelgeschwindigkeit angulaire giroscopio giróscopo angolare"
+    ),
+    ACCEL: _words(
+        "accel accelerometer acc acceleration a alpha force gf f beschleunigung beschleunigungen beschleunigungssensor "
+        "accélération accéléromètre aceleración acelerómetro accelerazione accelerometro"
+    ),
 }
 # Without gravity, as phones compute it. ROS calls the whole acceleration linear, and its length tells them apart.
-_REST = _words("linear lin user")
+_REST = _words("linear lin user lineare linéaire lineal")
 _UNCALIBRATED = _words("uncalibrated uncal raw")
 _NO_SIGNAL = _words(
     "magnetometer magnetic magneto mag compass orientation quaternion attitude euler bias var variance cov covariance "
@@ -34,7 +40,8 @@ _AXIS_AT_END = re.compile(r"([a-z]{0,14})([xyz])")
 _DEGREES = re.compile(r"deg|dps|\u00b0", re.IGNORECASE)
 _RADIANS = re.compile(r"rad", re.IGNORECASE)
 _METRES = re.compile(r"m[ /_]*s|mps", re.IGNORECASE)
-_IN_G = _words("g gs")
+_IN_G = _words("g gs mg mgs")
+_MILLI = re.compile(r"milli|\bm(?=dps|deg|rad|gs?\b)", re.IGNORECASE)
 
 
 class Triple(NamedTuple):
@@ -43,7 +50,8 @@ class Triple(NamedTuple):
     Attributes:
         kind: GYRO, ACCEL or GRAVITY; "" if the names do not say it.
         columns: their names.
-        unit: "deg", "rad", "g" or "m" (m/s^2) as the names say; "" if they do not.
+        unit: "deg", "rad", "g" or "m" (m/s^2) as the names say, with another "m" in front for a thousandth of the first
+            three; "" if they do not.
         rank: smaller for the better one of two of a kind.
     """
 
@@ -92,6 +100,8 @@ def _triple(words: Sequence[str], unit: str, columns: tuple[str, str, str]) -> T
     else:
         in_g = said & (_IN_G | {"gf"}) or {*unit.replace("-", " ").split()} & _IN_G
         given = "m" if _METRES.search(text) else "g" if in_g else ""
+    if given in ("deg", "rad", "g") and _MILLI.search(text):
+        given = f"m{given}"
     return Triple(kind, columns, given, 2 * bool(said & _REST) + bool(said & _UNCALIBRATED))
 
 

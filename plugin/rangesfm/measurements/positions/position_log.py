@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
+from rangesfm.util.files.text_tables import repeated
 from rangesfm.util.geometry.moments import ByTime, Moments
 
 # The coordinate system in a file's first line, as in ODM's files: by number, by PROJ's parameters, or as a zone of UTM.
@@ -96,7 +97,7 @@ class PositionLog:
         It has no coordinate system.
 
         Raises:
-            InputError: there is no position.
+            InputError: there is no position, or a photo has two.
         """
         total, told = len(position_m), list(notes)
         rows = np.flatnonzero(np.isfinite(position_m).all(axis=1))
@@ -111,6 +112,10 @@ class PositionLog:
             rows = order[np.append(True, np.diff(moments.timestamp_s[order]) > 0)]
             if len(rows) < num:
                 told.append(f"{num - len(rows)} of {num} positions have the time of an earlier one and are left out")
+        elif again := repeated(moments.subset(rows).image_name):
+            row, first = rows[list(again)]
+            message = f"photo {moments.image_name[row]} is in line {line[first]} already, expected each once"
+            raise InputError(message, path, int(line[row]))
         return PositionLog(
             position_m[rows],
             covariance_m2[rows],
