@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.measurements.lengths.tape import Marker
@@ -76,6 +77,19 @@ class Linearization:
         """Return groups that depend on blocks alone."""
         g, d = residual.shape
         return cls(residual, np.zeros((g, 0), dtype=np.int64), np.zeros((g, d, 0, 6)), by_block)
+
+
+def by_all_poses(pose: Indices, by_pose: Array, num: int) -> csr_array:
+    """Return the (g d, 6 num) sparse derivatives by the first ``num`` keyframes, with all others held.
+
+    Args:
+        pose, by_pose: (g, q), (g, d, q, 6) as of ``Linearization``.
+    """
+    num_rows = by_pose.shape[0] * by_pose.shape[1]
+    rows = np.broadcast_to(np.arange(num_rows).reshape(*by_pose.shape[:2], 1, 1), by_pose.shape)
+    columns = np.broadcast_to(6 * pose[:, None, :, None] + np.arange(6), by_pose.shape)
+    is_any = (by_pose != 0) & (columns < 6 * num)
+    return coo_array((by_pose[is_any], (rows[is_any], columns[is_any])), shape=(num_rows, 6 * num)).tocsr()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
@@ -285,17 +284,6 @@ class NamedPoints:
         by_direction = np.einsum("ki,ki->k", along, away)[:, None, None] * np.eye(3) + along[:, :, None] * away[:, None]
         stddev_px = self.markers[name].stddev_px
         return _point_of_rays(rays, state, position, inverse @ across, inverse @ by_direction, stddev_px)
-
-    def by_pose(self, point: MapPoint, num: int) -> csr_array:
-        """Return the (3, 6 num) derivatives of a point by the poses of the first keyframes, as in ``Linearization``.
-
-        Other parts of the map are held fixed.
-        """
-        slopes = np.zeros((3, num, 6))
-        for keyframe, by in self._by_keyframe(point.by_part, self.state):
-            if keyframe < num:
-                slopes[:, keyframe] = by
-        return csr_array(slopes.reshape(3, -1))
 
     def linearized(
         self, state: MapState, residuals: Sequence[Array], slopes: Sequence[Sequence[tuple[Array, MapPoint]]]

@@ -14,10 +14,12 @@ from scipy.sparse import csr_array, vstack
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.measurements.kind import by_all_poses
 from rangesfm.measurements.lengths.tape import CONTROL, Tape, TapedDistance
 from rangesfm.measurements.points import NamedPoints, images_by_name, variance_along
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.util.geometry.map_errors import MapPoint
 
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
 _MIN_STDDEV_M = 1e-3
@@ -145,7 +147,8 @@ def locate_distances(
             marks of a marker are too few, seen from one direction only, or not of one point. The error gives the line.
     """
     points, num = NamedPoints.in_model(model, tape.markers, first_ids=frame_ids), len(tape.distances)
-    length, mark_stddev, by_pose = np.full(num, np.nan), np.zeros(num), np.zeros((num, 6 * len(frame_ids)))
+    length, mark_stddev = np.full(num, np.nan), np.zeros(num)
+    slopes: list[list[tuple[Array, MapPoint]]] = [[] for _ in tape.distances]
     pairs = np.full((num, 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
         if all(name in points for name in taped.ends):
@@ -154,13 +157,14 @@ def locate_distances(
             length[row] = np.linalg.norm(away)
             mark_stddev[row] = np.sqrt(variance_along(start.position_m, end.position_m, start.own_m2 + end.own_m2))
             if not taped.is_everywhere:
-                along = away / max(length[row], 1e-12)
-                by_pose[row] = along @ (points.by_pose(end, len(frame_ids)) - points.by_pose(start, len(frame_ids)))
+                along = away[None] / max(length[row], 1e-12)
+                slopes[row] = [(-along, start), (along, end)]
         elif set(anchor_ids).issuperset(taped.ends):
             pairs[row] = [anchor_ids.index(name) for name in taped.ends]
         else:
             known = [*points.views, *points.markers]
             raise InputError(_what_is_wrong(taped, known, anchor_ids), tape.distances_path, taped.line)
+    by = points.linearized(points.state, [*length[:, None]], slopes)
     return LocatedDistances(
         length,
         pairs,
@@ -169,7 +173,7 @@ def locate_distances(
         np.array([taped.kind != CONTROL for taped in tape.distances], dtype=bool),
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
-        csr_array(by_pose),
+        by_all_poses(by.pose, by.by_pose, len(frame_ids)),
     )
 
 

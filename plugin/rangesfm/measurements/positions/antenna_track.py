@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.clock.offset import TimeOffset
+from rangesfm.measurements.kind import by_all_poses
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
@@ -87,8 +87,8 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
         time_s=at_s,
         velocity=velocity,
         world_from_cam=path.world_from_cam[at.nearest],
-        by_pose=_sparse(parts * [0, 0, 0, 1, 1, 1], places.keyframes, len(path)),
-        arms_by_pose=_sparse(parts * [1, 1, 1, 0, 0, 0], places.keyframes, len(path)),
+        by_pose=by_all_poses(places.keyframes, parts * [0, 0, 0, 1, 1, 1], len(path)),
+        arms_by_pose=by_all_poses(places.keyframes, parts * [1, 1, 1, 0, 0, 0], len(path)),
         on_path=places,
     )
 
@@ -103,11 +103,3 @@ def _places(track: AntennaTrack, path: Trajectory) -> OnPath:
     max_gap_s, max_difference_s = options.max_interpolation_gap_s, options.max_time_difference_s
     known_s = path.timestamps_s
     return places_in_time(track.image_times_s, known_s, max_gap_s=max_gap_s, max_difference_s=max_difference_s)
-
-
-def _sparse(parts: Array, on_path: Indices, num: int) -> csr_array:
-    """Return the (3 k, 6 n) derivatives of k places by the poses of a path, given those (k, 3, 2, 6) by two each."""
-    rows = np.broadcast_to(3 * np.arange(len(parts))[:, None, None, None] + np.arange(3)[:, None, None], parts.shape)
-    columns = np.broadcast_to(6 * on_path[:, None, :, None] + np.arange(6), parts.shape)
-    is_any, shape = parts != 0, (3 * len(parts), 6 * num)
-    return coo_array((parts[is_any], (rows[is_any], columns[is_any])), shape=shape).tocsr()

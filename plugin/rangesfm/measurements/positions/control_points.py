@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.kind import by_all_poses
 from rangesfm.measurements.lengths.tape import CONTROL, Marker
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
@@ -90,7 +91,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
     named = NamedPoints.in_model(model, points.markers, first_ids=path.frame_ids)
     k = len(seen := [point for point in points.points if named.is_shown(point.name)])
     found = [named.find_mark(point.name) for point in seen]
-    by_pose = [named.by_pose(each, len(path)) for each in found]
+    at = named.linearized(named.state, [each.position_m for each in found], [[(np.eye(3), each)] for each in found])
     stddev_m = np.array([point.stddev_m for point in seen])
     return KnownPositions(
         names=tuple(point.name for point in seen),
@@ -98,14 +99,14 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         is_check=np.array([point.kind != CONTROL for point in seen], dtype=bool),
         position_m=np.array([point.position_m for point in seen]).reshape(-1, 3),
         covariance_m2=stddev_m[:, None, None] ** 2 * np.eye(3),
-        places=np.array([each.position_m for each in found]).reshape(-1, 3),
+        places=at.residual.reshape(-1, 3),
         arms_m=np.zeros((k, 3)),
         own_covariance=np.array([each.own_m2 for each in found]).reshape(-1, 3, 3),
         arm_stddev_m=np.zeros(k),
         time_s=np.full(k, np.nan),
         velocity=np.zeros((k, 3)),
         world_from_cam=np.zeros((k, 3, 3)),
-        by_pose=vstack([csr_array((0, 6 * len(path))), *by_pose], format="csr"),
+        by_pose=by_all_poses(at.pose, at.by_pose, len(path)),
         arms_by_pose=csr_array((3 * k, 6 * len(path))),
         on_path=AntennaPlaces.nowhere(k),
     )

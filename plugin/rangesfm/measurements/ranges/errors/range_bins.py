@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.kind import by_all_poses
 from rangesfm.measurements.ranges.errors.noise import MIN_NUM_OF_SCATTER
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
@@ -133,14 +134,9 @@ def by_poses(
     by_shift = metric_from_path.scale * gradient.by_tag @ metric_from_path.rotation
     arms_in_cam_m, in_cam = (np.einsum("nji,nj->ni", world_from_cam, of) for of in (arms_m, gradient.by_tag))
     by_turn = np.cross(arms_in_cam_m, in_cam)
-    values = np.hstack([by_turn, by_shift])
-    rows = np.repeat(np.arange(len(values)), 6)
-    parts = [
-        ((share[:, None] * values).ravel(), rows, (6 * pose[:, None] + np.arange(6)).ravel())
-        for pose, share in ((on_path.before, 1 - on_path.fraction), (on_path.after, on_path.fraction))
-    ]
-    value, row, column = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return coo_array((value, (row, column)), shape=(len(values), 6 * num_poses)).tocsr()
+    share = np.column_stack([1 - on_path.fraction, on_path.fraction])
+    values = share[:, None, :, None] * np.hstack([by_turn, by_shift])[:, None, None]
+    return by_all_poses(np.column_stack([on_path.before, on_path.after]), values, num_poses)
 
 
 def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:
