@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
@@ -329,11 +329,7 @@ def test_wrong_flag_is_not_blamed_on_the_file(folder: Path) -> None:
     assert "every_nth is 0" in str(error)
 
 
-def test_missing_survey_is_refused(tmp_path: Path) -> None:
-    assert "no such file" in str(refusal(tmp_path / "none.toml"))
-
-
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(
     st.one_of(
         st.binary(max_size=100),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SAME = 1e-9
 ANCHORS = ("A", "B", "C", "D", "E")
-a_few = settings(max_examples=4, derandomize=True)
+a_few = settings(max_examples=4)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.measurements.ranges.readers.test_readers_ros import TYPES
 from tests.simulated.inertial import by_hand, imu_log
@@ -367,7 +367,7 @@ def test_a_bag_without_a_sensor_and_an_archive_without_tables_are_refused(tmp_pa
         read_imu(tmp_path / "missing.csv")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_log_is_read_or_refused_with_one_line(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from tests.survey.sources.damage import DAMAGES, Damage
@@ -194,7 +194,7 @@ def test_what_is_no_photo_is_refused_in_one_line(kind: str, fields: dict[str, An
         open_bag(tmp_path, [("/image", kind, 1.0, fields)])
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30)
 @given(damage=DAMAGES)
 def test_a_damaged_bag_is_read_or_refused(damage: Damage, tmp_path_factory: pytest.TempPathFactory) -> None:
     messages: list[Message] = [

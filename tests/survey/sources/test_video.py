@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from PIL import Image
 from tests.survey.sources.damage import DAMAGES, Damage
 from tests.survey.sources.recorded import PORTRAIT, write_video
@@ -80,7 +80,7 @@ def test_missing_package_is_said_with_the_command_that_installs_it(
         open_source(tmp_path / "a.mp4", "")
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30)
 @given(damage=DAMAGES)
 def test_a_damaged_video_is_read_or_refused(damage: Damage, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = write_video(tmp_path_factory.mktemp("video") / "a.mp4", pictures(5), TIMES_S)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.known import known
 
@@ -106,7 +106,7 @@ def test_missing_coordinate_column_is_named(tmp_path: Path) -> None:
     assert "not sure: no column seems to be z (height)" in error.advice
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 @given(content=st.one_of(st.binary(max_size=100), st.text('0123456789,.-\n\r#" naif', max_size=80).map(str.encode)))
 @pytest.mark.parametrize("header", [b"", FULL_HEADER.encode() + b"\n", HEADER.encode() + b"\n"])
 def test_any_bytes_are_anchors_or_an_input_error(tmp_path: Path, header: bytes, content: bytes) -> None:

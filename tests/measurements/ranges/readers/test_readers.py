@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
@@ -16,7 +16,7 @@ from rangesfm.measurements.ranges.readers import read_ranges, reader_names, writ
 from rangesfm.measurements.ranges.readers.measured import REACH_M
 from rangesfm.util.geometry.moments import ByPhoto
 
-any_bytes_in_one_folder = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+any_bytes_in_one_folder = settings(max_examples=150)
 
 
 def write(folder: Path, content: str | bytes) -> Path:

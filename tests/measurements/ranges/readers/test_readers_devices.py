@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
@@ -363,7 +363,7 @@ prefixes = st.one_of(
 )
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300)
 @given(data=st.data())
 def test_damaged_logs_are_read_or_refused(tmp_path: Path, data: st.DataObject) -> None:
     lines = data.draw(st.lists(st.tuples(prefixes, st.sampled_from(ALL)).map("".join), min_size=1, max_size=3))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -212,7 +212,7 @@ def test_missing_package_is_said_with_the_command_that_installs_it(
         read_ranges(tmp_path / "x.bag")
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40)
 @given(
     suffix=st.sampled_from([".bag", ".mcap", ".db3"]),
     damage=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=20),

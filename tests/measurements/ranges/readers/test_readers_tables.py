@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesfm.cli import main
@@ -585,7 +585,7 @@ HEADERS = (
 )
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150)
 @given(header=st.sampled_from(HEADERS), rows=st.lists(st.lists(cells, min_size=2, max_size=4), max_size=6))
 def test_any_cells_of_any_table_are_a_log_or_an_input_error(tmp_path: Path, header: str, rows: list[list[str]]) -> None:
     path = write(tmp_path, (header + "\n" + "\n".join(",".join(row) for row in rows)).encode())
