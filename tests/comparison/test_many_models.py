@@ -107,12 +107,6 @@ def test_ranges_tell_the_metric_model_from_the_unscaled(result: Path, models: tu
     assert unscaled.range_rms_m[1] == pytest.approx(metric.range_rms_m[0], rel=1e-6)
 
 
-def test_a_results_ranges_fit_its_own_model_as_its_file_says(result: Path, models: tuple[Path, Path, Path]) -> None:
-    own, _ = compared(result, models[0]).rows
-    said = json.loads((result / "result.json").read_text())["ranges"]["rms_m"]
-    assert own.range_rms_m[0] == pytest.approx(said, rel=1e-4)
-
-
 def test_a_results_row_is_the_same_whatever_it_is_compared_with(
     result: Path, walked_survey: WalkedSurvey, tmp_path: Path
 ) -> None:
@@ -125,7 +119,7 @@ def test_a_results_row_is_the_same_whatever_it_is_compared_with(
     other, beside = compared(tmp_path / "other", result).rows
     for row, folder in ((alone, result), (beside, result), (other, tmp_path / "other")):
         said = json.loads((folder / "result.json").read_text())["ranges"]["rms_m"]
-        assert row.range_rms_m[0] == pytest.approx(said, rel=1e-3)
+        assert row.range_rms_m[0] == pytest.approx(said, rel=1e-4)
 
 
 def test_a_log_is_held_against_models_that_no_run_has_made(

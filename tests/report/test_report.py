@@ -442,12 +442,6 @@ def test_a_long_log_makes_no_long_page(make_result: MakeResult) -> None:
     assert any("One range in 6 is drawn" in text for text in page_of(folder).texts)
 
 
-def test_a_folder_that_is_not_a_result_is_refused_and_left_alone(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no result\.json"):
-        write_report(tmp_path)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_broken_table_is_named_with_its_line(make_result: MakeResult) -> None:
     folder = make_result(num_keyframes=5, num_ranges_per_anchor=5)
     lines = (folder / "ranges.csv").read_text().splitlines()
