@@ -26,7 +26,8 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.survey.survey_reader import read_survey
-from rangesfm.util.files.atomic import sole_writer, write_text
+from rangesfm.util.files.atomic import write_text
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import read_reference
 

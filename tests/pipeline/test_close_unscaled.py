@@ -21,7 +21,7 @@ from rangesfm.sfm.loops.candidates import Views
 from rangesfm.sfm.loops.loop_finder import LoopFinder
 from rangesfm.sfm.steps import Workspace
 from rangesfm.survey.settings import Survey
-from rangesfm.util.files.output_folder import sole_writer
+from rangesfm.util.files.output_folder import OutputFolder, sole_writer
 from rangesfm.util.geometry.similarity import IDENTITY, align_points, rmse
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
@@ -86,7 +86,7 @@ def test_one_that_was_stopped_before_its_model_took_its_place_closes_them_again(
     made = Reconstructed.of(around_a_room(), tmp_path / "out")
     open_m = made.error_m(made.model)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopMatching, "publish_with", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(OutputFolder, "publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             made.close()
     assert made.error_m(made.model) == open_m

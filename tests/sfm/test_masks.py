@@ -18,7 +18,7 @@ from rangesfm.progress import SILENT
 from rangesfm.sfm.photo_matching import photo_matching
 from rangesfm.sfm.rigs import NO_RIGS
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
-from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.output_folder import sole_writer
 
 if TYPE_CHECKING:
     from tests.sfm.conftest import Room

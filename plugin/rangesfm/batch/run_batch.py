@@ -15,7 +15,8 @@ from rangesfm.batch.jobs import BatchOptions, Job
 from rangesfm.batch.workers import MAX_STOP_S, Crew, on_scheduler, on_this_machine
 from rangesfm.errors import FAILED, Failure
 from rangesfm.solver.installation_checks import recorded_versions
-from rangesfm.util.files.atomic import sole_writer, write_text
+from rangesfm.util.files.atomic import write_text
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.files.records import write_json
 from rangesfm.util.files.text_tables import write_table
 

@@ -12,7 +12,7 @@ from rangesfm.export.metric_map import colored_points
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.scene import ScenePath, view_of
-from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.trajectory import Trajectory
 
 COLORS = ("after", "before", "third", "fourth")

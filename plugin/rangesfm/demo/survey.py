@@ -24,8 +24,8 @@ from rangesfm.errors import InputError
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
-from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
-from rangesfm.util.files.output_folder import PRIVATE_NAME
+from rangesfm.util.files.atomic import new_folder, write_text
+from rangesfm.util.files.output_folder import PRIVATE_NAME, sole_writer
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 

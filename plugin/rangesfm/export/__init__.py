@@ -27,8 +27,8 @@ from rangesfm.export.photogrammetry import NERFSTUDIO_IMAGES, write_nerfstudio, 
 from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
 from rangesfm.options import ExportOptions
-from rangesfm.util.files.atomic import make_output_folder
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.output_folder import make_output_folder
 from rangesfm.util.geometry.similarity import Similarity
 
 __all__ = [

@@ -24,7 +24,8 @@ from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_model
 from rangesfm.export.metric_map import colored_points, registered_images
 from rangesfm.export.ply import read_ply, says_metres, transform_ply
-from rangesfm.util.files.atomic import make_output_folder, require_apart, write_text
+from rangesfm.util.files.atomic import require_apart, write_text
+from rangesfm.util.files.output_folder import make_output_folder
 from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.files.records import read_json, write_json
 from rangesfm.util.files.text_tables import read_text

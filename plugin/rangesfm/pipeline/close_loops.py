@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 import pycolmap
@@ -78,7 +79,7 @@ def close_loops_of_survey(run: SurveyRun, metric: MetricResult) -> MetricResult:
             return None if closed is None or closed.refined is None else (closed, closed.refined.why_broken)
 
         last, loops = _close_in_rounds(run.journal, matching, metric, _finder_in, close, by_likeness=False)
-        matching.publish(output)
+        output.defer(matching.places)
         if loops.contradicted:
             first, second = (last.final.image(image_id).name for image_id in min(loops.contradicted))
             run.journal.warn(
@@ -118,15 +119,15 @@ def close_loops_of_models(
             f"loops: {len(tried.proposed)} pairs of photos may show the same place; {len(tried.verified)} of them "
             f"match; {len(tried.closed)} were used to close loops{wrong}"
         )
-        if not tried.closed:
-            matching.publish_with(output)
-            return models[0]
-        staged = matching.folder / "model"
-        staged.mkdir(exist_ok=True)
-        write_binary_model(model, staged)
-        place = output.path / MODELS_NAME / "0"
-        matching.publish_with(output, {place: staged}, [output.path / name for name in RESULT_NAMES])
-        return model
+        new, superseded = matching.places, list[Path]()
+        if tried.closed:
+            staged = new[output.path / MODELS_NAME / "0"] = matching.folder / "model"
+            staged.mkdir(exist_ok=True)
+            write_binary_model(model, staged)
+            superseded = [output.path / name for name in RESULT_NAMES]
+        output.publish(new, superseded)
+        matching.discard()
+        return model if tried.closed else models[0]
 
 
 def _close_in_rounds(

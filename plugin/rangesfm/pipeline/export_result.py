@@ -16,8 +16,8 @@ from rangesfm.options import ExportOptions
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import CenterCovariances
 from rangesfm.sfm.steps import DATABASE_NAME
-from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.similarity import IDENTITY
 
 

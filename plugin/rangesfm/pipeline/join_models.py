@@ -162,7 +162,7 @@ def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel]) -> list[PathOfMo
             with colmap_log(matching.log):
                 for path in (path for path in tied if not any(path is one for one in paths)):
                     adjust_whole(database, path.sfm, options=_options(run, database))
-            matching.publish(output)
+            output.defer(matching.places)
     if not pairs:
         return list(paths)
     models = sorted((path.sfm for path in tied), key=lambda model: -model.num_reg_images())

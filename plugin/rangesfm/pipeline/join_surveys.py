@@ -30,8 +30,9 @@ from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.util.files.atomic import require_apart, sole_writer
+from rangesfm.util.files.atomic import require_apart
 from rangesfm.util.files.folders import real_path
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.reference import NO_REFERENCE
 from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread

@@ -38,12 +38,12 @@ from rangesfm.sfm.unpublished import UnpublishedReconstruction
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
-from rangesfm.survey.sources.extract import TIMES_NAME, earlier_photos, take_photos
+from rangesfm.survey.sources.extract import TIMES_NAME, take_photos
 from rangesfm.survey.sources.source import is_source
 from rangesfm.survey.survey_reader import input_paths
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.files.folders import real_path
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -172,9 +172,9 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
     rate_hz, topic = survey.images.extraction_rate_hz, survey.images.topic
     places = places_for_photos(survey.output.path)
     with journal.stage("photos"):
-        taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
-        folder = places[0] if restart else next(taken_before, places[0])
-        taken = take_photos(path, folder, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart)
+        folder, taken = take_photos(
+            path, places, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart
+        )
     journal.note(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera

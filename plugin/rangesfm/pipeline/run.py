@@ -41,7 +41,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread

@@ -8,8 +8,8 @@ from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
 from rangesfm.report.report_page import render_report, sections_of, write_page
 from rangesfm.result.result_folder import REPORT_NAME, read_result_folder
-from rangesfm.util.files.atomic import sole_writer
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.output_folder import sole_writer
 
 __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 

@@ -19,7 +19,8 @@ from rangesfm.errors import InputError
 from rangesfm.report.packing import pack
 from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
 from rangesfm.report.scene import data_uri
-from rangesfm.util.files.atomic import make_output_folder, new_file
+from rangesfm.util.files.atomic import new_file
+from rangesfm.util.files.output_folder import make_output_folder
 from rangesfm.util.processes.draw_pictures import draw_pictures
 
 ASSETS = Path(__file__).with_name("assets")

@@ -19,7 +19,8 @@ from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, Vi
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, duration, fixed, percent, rough
-from rangesfm.util.files.atomic import make_output_folder, write_text
+from rangesfm.util.files.atomic import write_text
+from rangesfm.util.files.output_folder import make_output_folder
 from rangesfm.util.geometry.numerics import NORMAL_95
 
 # From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.

@@ -18,8 +18,9 @@ from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_err
 from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
-from rangesfm.util.files.atomic import path_of, scratch_folder, sole_writer
+from rangesfm.util.files.atomic import path_of, scratch_folder
 from rangesfm.util.files.folders import real_path
+from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.reference import NO_REFERENCE, Reference, read_reference
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction

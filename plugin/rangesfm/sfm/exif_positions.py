@@ -12,9 +12,10 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_formats import AUTONOMOUS_STDDEV_M
-from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.sfm.image_times import list_images
 from rangesfm.sfm.photo_files import GpsData, gps_data
+from rangesfm.util.geometry.georeference import GEOGRAPHIC
 from rangesfm.util.geometry.moments import ByPhoto
 
 _STATUS, _VOID, _DILUTION, _HORIZONTAL_ERROR = 9, "V", 11, 31

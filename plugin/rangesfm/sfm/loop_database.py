@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import shutil
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pycolmap
@@ -67,6 +66,7 @@ class LoopMatching(Workspace):
     def __init__(self, source: Path, options: MatchingOptions, progress: Progress, output: OutputFolder):
         folder, record = output.private / _FOLDER_NAME, output.newest(output.path / RECORD_NAME)
         self.options = options
+        self._output = output
         # Whether the database is that of a reconstruction in the output folder.
         self._has_record = record.is_file() and source == output.newest(output.path / DATABASE_NAME)
         if source.parent != folder:  # else this run has closed loops before, and closes them again
@@ -160,24 +160,14 @@ class LoopMatching(Workspace):
         self._note_pairs(_CLOSED, _noted(self, _LOOPS))
         self._note_pairs(_LOOPS, ())
 
-    def publish(self, output: OutputFolder) -> None:
-        """Let the database, and the record that notes its loops, take their places with the next whole result."""
-        output.defer(self._places(output))
+    @property
+    def places(self) -> dict[Path, Path]:
+        """The database and the record that notes its loops, by the places in the output folder that they are to take.
 
-    def publish_with(
-        self, output: OutputFolder, more: Mapping[Path, Path] = MappingProxyType({}), superseded: Sequence[Path] = ()
-    ) -> None:
-        """Let the database, its record and more files take their places at once; arguments as ``OutputFolder.publish``.
-
-        Raises:
-            InputError: something in one of the places is not this tool's own.
+        See ``OutputFolder.publish`` and ``OutputFolder.defer``.
         """
-        output.publish({**self._places(output), **more}, superseded)
-        self.discard()
-
-    def _places(self, output: OutputFolder) -> dict[Path, Path]:
         names = (DATABASE_NAME, RECORD_NAME) if self._has_record else (DATABASE_NAME,)
-        return {output.path / name: self.folder / name for name in names}
+        return {self._output.path / name: self.folder / name for name in names}
 
     def discard(self) -> None:
         """Remove the copy."""

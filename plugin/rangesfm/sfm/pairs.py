@@ -77,8 +77,12 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: PairingOptions 
     Raises:
         ReconstructionError: the list of pairs contains no pair of these photos.
     """
-    if isinstance(pairing, tuple):
-        return _pairs_of_names(photos.names, pairing)
+    pairs = _named(photos.names, pairing) if isinstance(pairing, tuple) else _generated(database_path, photos, pairing)
+    # Pairing by similarity also pairs each photo with itself, its most similar photo. These pairs are left out.
+    return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
+
+
+def _generated(database_path: Path, photos: Photos, pairing: PairingOptions) -> Sequence[tuple[int, int]]:
     generators: dict[type[PairingOptions], Callable[..., Any]] = {
         pycolmap.ExhaustivePairingOptions: pycolmap.ExhaustivePairGenerator,
         pycolmap.SequentialPairingOptions: pycolmap.SequentialPairGenerator,
@@ -90,7 +94,8 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: PairingOptions 
     naming = named_by_place(database_path, photos.names) if is_sequential else nullcontext()
     with naming, pycolmap.Database.open(database_path) as database:
         try:
-            pairs = generators[type(pairing)](pairing, database).all_pairs()
+            pairs: Sequence[tuple[int, int]] = generators[type(pairing)](pairing, database).all_pairs()
+            return pairs
         except (RuntimeError, ValueError) as error:
             if not isinstance(pairing, pycolmap.VocabTreePairingOptions):
                 raise
@@ -98,15 +103,13 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: PairingOptions 
             raise InputError(
                 f"is not a vocabulary tree for these features ({reason})", pairing.vocab_tree_path
             ) from None
-    # Pairing by similarity also pairs each photo with itself, its most similar photo. These pairs are left out.
-    return sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
 
 
-def _pairs_of_names(names: Sequence[str], pairs: NamedPairs) -> list[tuple[int, int]]:
+def _named(names: Sequence[str], pairs: NamedPairs) -> list[tuple[int, int]]:
     ids = {name: id_ for id_, name in enumerate(names, 1)}
     known = [(ids[first], ids[second]) for first, second in pairs if first in ids and second in ids]
     if not known:
         raise ReconstructionError(
             f"none of {len(pairs)} pairs names two keyframes, expected names relative to the folder, such as {names[0]}"
         )
-    return sorted({(min(pair), max(pair)) for pair in known})
+    return known

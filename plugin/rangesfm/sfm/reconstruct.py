@@ -20,8 +20,9 @@ from rangesfm.sfm.photo_matching import photo_matching
 from rangesfm.sfm.rigs import NO_RIGS, Rigs
 from rangesfm.sfm.steps import Workspace, fingerprint
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
-from rangesfm.util.files.atomic import scratch_folder, sole_writer
+from rangesfm.util.files.atomic import scratch_folder
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.output_folder import sole_writer
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from rangesfm.colmap.transform import transform
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.tape import CONTROL, TapedDistance
 from rangesfm.options import COORDINATE_M
 from rangesfm.util.files.records import read_json
+from rangesfm.util.geometry.similarity import IDENTITY
 
 # Cameras nearer to each other than this share a centre, like those of a panorama, and give no length.
 _MIN_BASELINE_M = 1e-4
@@ -143,7 +145,7 @@ class Rigs:
             if (length := _distance(model, pair)) > 0
         ]
         if ratios:
-            model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
+            transform(model, replace(IDENTITY, scale=float(np.median(ratios))))
 
     def _baselines_in(
         self, model: pycolmap.Reconstruction

@@ -12,10 +12,11 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.positions.position_formats import read_positions
-from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.measurements.ranges.readers.unclear import UnclearFileError
 from rangesfm.options import PositionOptions
+from rangesfm.util.geometry.georeference import GEOGRAPHIC
 
 DAY_S = datetime(2024, 3, 1, tzinfo=timezone.utc).timestamp()
 

@@ -59,7 +59,7 @@ def film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Film:
 
 def take(film: Film, *, rate_hz: float = 2.0, topic: str = "", restart: bool = False) -> TakenPhotos:
     folder = film.path.parent / "out" / "photos"
-    return take_photos(film.path, folder, rate_hz=rate_hz, topic=topic, progress=Progress(), restart=restart)
+    return take_photos(film.path, [folder], rate_hz=rate_hz, topic=topic, progress=Progress(), restart=restart)[1]
 
 
 def test_of_each_interval_the_sharpest_is_chosen_and_an_empty_one_has_none() -> None:

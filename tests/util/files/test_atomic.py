@@ -17,8 +17,8 @@ import pytest
 from tests.outputs import names_in, paths_below
 
 from rangesfm.errors import InputError
-from rangesfm.util.files.atomic import new_file, new_folder, require_apart, scratch_folder, sole_writer, write_text
-from rangesfm.util.files.output_folder import PRIVATE_NAME
+from rangesfm.util.files.atomic import new_file, new_folder, require_apart, scratch_folder, write_text
+from rangesfm.util.files.output_folder import PRIVATE_NAME, sole_writer
 
 ROOT = Path(__file__).parents[3]
 KILLED_IN_PUBLISHING = """

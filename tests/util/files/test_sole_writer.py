@@ -19,8 +19,8 @@ from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.util.files.atomic import new_file, new_folder, sole_writer
-from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME
+from rangesfm.util.files.atomic import new_file, new_folder
+from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME, sole_writer
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 HOLD = """
 import sys
 from pathlib import Path
-from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.output_folder import sole_writer
 with sole_writer(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.readline()
@@ -168,7 +168,8 @@ def test_a_folder_made_for_nothing_is_gone_again(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rangesfm.util.files.atomic import new_file, new_folder, sole_writer
+from rangesfm.util.files.atomic import new_file, new_folder
+from rangesfm.util.files.output_folder import sole_writer
 with sole_writer(Path()), new_folder(Path("models") / "0") as folder, new_file(Path("table.csv")) as file:
     (folder / "x").touch()
     file.touch()

@@ -10,7 +10,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.util.geometry.georeference import GEOGRAPHIC
 from rangesfm.util.geometry.moments import ByPhoto
 
 _MARK = "SQLite format 3"

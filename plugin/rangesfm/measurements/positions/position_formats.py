@@ -23,7 +23,7 @@ from rangesfm.measurements.positions.position_columns import (
     STDDEVS,
     is_degrees,
 )
-from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line, is_no_row
+from rangesfm.measurements.positions.position_log import PositionLog, crs_in_head, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.layout import MISSING
@@ -38,6 +38,7 @@ from rangesfm.util.files.text_tables import (
     read_text,
     read_without_header,
 )
+from rangesfm.util.geometry.georeference import GEOGRAPHIC
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
 

@@ -17,8 +17,6 @@ from rangesfm.util.geometry.moments import ByTime, Moments
 # The coordinate system in a file's first line, as in ODM's files: by number, by PROJ's parameters, or as a zone of UTM.
 _CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
 _EPSG = re.compile(r"EPSG\W{1,5}(\d{4,5})\b", re.IGNORECASE)
-GEOGRAPHIC = "EPSG:4979"
-"""WGS 84: longitude and latitude in degrees, ellipsoidal height in metres."""
 
 
 def crs_of_line(text: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -52,22 +52,26 @@ class TakenPhotos(Record):
 
 
 def take_photos(
-    path: Path, folder: Path, *, rate_hz: float, topic: str, progress: Progress, restart: bool = False
-) -> TakenPhotos:
+    path: Path, places: Sequence[Path], *, rate_hz: float, topic: str, progress: Progress, restart: bool = False
+) -> tuple[Path, TakenPhotos]:
     """Write the sharpest frame of each ``1 / rate_hz`` seconds as a photo, and ``images.csv`` with their times.
 
     Args:
-        folder: for the photos. It is made or replaced when all is done. If it has these photos already, it is not
-            changed.
+        places: folders that may have these photos already, of which one is then used as it is. Otherwise the first one
+            is made or replaced when all is done.
         topic: of the images in a bag; empty: the bag has only one image topic.
+
+    Returns:
+        The folder of the photos, and their record.
 
     Raises:
         InputError: the source cannot be read, or has fewer than two photos.
     """
-    earlier = None if restart else earlier_photos(path, folder, rate_hz=rate_hz, topic=topic)
-    if earlier is not None:
-        progress.message("photos: taken over from an earlier run")
-        return earlier
+    for place in () if restart else places:
+        if (earlier := _earlier_photos(path, place, rate_hz=rate_hz, topic=topic)) is not None:
+            progress.message("photos: taken over from an earlier run")
+            return place, earlier
+    folder = places[0]
     wanted = TakenPhotos(files=_files(path, {}), rate_hz=rate_hz, topic=topic)
     progress.stage("photos")
     source = open_source(path, topic)
@@ -80,10 +84,10 @@ def take_photos(
         taken = wanted.model_copy(update=found)
         taken.write(new / RECORD_NAME)
     progress.message(f"photos: {len(times_s)} in {folder} ({num_bytes / 1e6:.3g} MB)")
-    return taken
+    return folder, taken
 
 
-def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str) -> TakenPhotos | None:
+def _earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str) -> TakenPhotos | None:
     """Return the record of photos that an earlier run extracted from the same source with the same choice.
 
     None where there are none, or where some are missing from ``folder``.

@@ -11,19 +11,7 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.util.files.folders import real_path
-from rangesfm.util.files.output_folder import absolute, is_private, make_output_folder, remove, sole_writer, writer_of
-
-__all__ = [
-    "is_plain_name",
-    "make_output_folder",
-    "new_file",
-    "new_folder",
-    "path_of",
-    "require_apart",
-    "scratch_folder",
-    "sole_writer",
-    "write_text",
-]
+from rangesfm.util.files.output_folder import absolute, is_private, remove, writer_of
 
 # Unicode categories: control characters, bytes that are not text, line separators and paragraph separators.
 _NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,7 +80,8 @@ class Trajectory:
         rows = sorted(known, key=lambda row: timestamps_s[self.image_names[row]])
         names = tuple(self.image_names[row] for row in rows)
         times = np.array([timestamps_s[name] for name in names], dtype=np.float64)
-        return Trajectory(self.frame_ids[rows], names, times, self.centers[rows], self.world_from_cam[rows])
+        turns = self.world_from_cam[rows]
+        return Trajectory(self.frame_ids[rows], names, times, self.centers[rows], turns, self.time_resolution_s)
 
     def resized(self, factor: float, frame: str) -> Trajectory:
         """Return the path scaled by a factor around a fixed point.
@@ -184,24 +186,18 @@ def trajectory_from_reconstruction(
             no time are left out. None: the path has no times and is ordered by name.
         time_resolution_s: step to which the times were rounded or truncated.
     """
-    rows = []
-    for frame_id in reconstruction.reg_frame_ids():
-        frame = reconstruction.frame(frame_id)
-        name = _reference_image_name(reconstruction, frame)
-        time = 0.0 if timestamps_s is None else timestamps_s.get(name)
-        if time is not None:
-            pose = pose_of(frame)
-            rows.append((time, name, frame_id, pose.tgt_origin_in_src(), pose.rotation.matrix().T))
-    rows.sort(key=lambda row: row[:2])
-    times, names, frame_ids, centers, turns = zip(*rows) if rows else ((),) * 5
-    return Trajectory(
-        np.array(frame_ids, dtype=np.int64),
-        tuple(names),
-        None if timestamps_s is None else np.array(times, dtype=np.float64),
-        np.array(centers, dtype=np.float64).reshape(-1, 3),
-        np.array(turns, dtype=np.float64).reshape(-1, 3, 3),
+    frames = map(reconstruction.frame, reconstruction.reg_frame_ids())
+    named = sorted(((_reference_image_name(reconstruction, frame), frame) for frame in frames), key=itemgetter(0))
+    poses = [pose_of(frame) for _, frame in named]
+    path = Trajectory(
+        np.array([frame.frame_id for _, frame in named], dtype=np.int64),
+        tuple(name for name, _ in named),
+        None,
+        np.array([pose.tgt_origin_in_src() for pose in poses], dtype=np.float64).reshape(-1, 3),
+        np.array([pose.rotation.matrix().T for pose in poses], dtype=np.float64).reshape(-1, 3, 3),
         time_resolution_s,
     )
+    return path if timestamps_s is None else path.timed(timestamps_s)
 
 
 def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Indices]]:

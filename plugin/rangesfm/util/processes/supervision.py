@@ -47,7 +47,10 @@ _STACK_TRACE = re.compile(r"\*\*\*|@|PC:|=+ |.*\[0x[0-9a-f]+\]$")
 
 
 class MessagesToParent(Progress):
-    """Progress of the work as messages, one a line; only some of the many updates are sent."""
+    """Progress of the work as messages, one a line; only some of the many updates are sent.
+
+    Warnings are part of the results, and are not sent.
+    """
 
     def __init__(self, stream: TextIO):
         self._stream = stream
@@ -62,9 +65,6 @@ class MessagesToParent(Progress):
         if now - self._last_update >= _UPDATE_INTERVAL_S:
             self._last_update = now
             self.send({"num_done": num_done, "num_total": num_total})
-
-    def message(self, text: str) -> None:
-        """Send nothing, because warnings are part of the results."""
 
     def send(self, message: dict[str, Any]) -> None:
         self._stream.write(json.dumps(message) + "\n")

@@ -32,8 +32,8 @@ from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileErro
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable, repeated, write_user_table
+from rangesfm.util.geometry.georeference import GEOGRAPHIC
 
-_GEOGRAPHIC = "EPSG:4979"
 _MAX_NUM_WAYS = 6  # ways to read a list that are offered
 _BESIDE = terms.LINKING | terms.BESIDE_COORDINATE | terms.RANGE
 # Words in the names of columns by quantity, and those beside them.
@@ -132,7 +132,7 @@ def find_points(form: TableForm, path: Path, layout: Layout) -> dict[str, str] |
     if not doubts and degrees:
         named = columns | degrees
         doubts.append(f"{degrees['y']} and {degrees['x']} are degrees, of no known coordinate system")
-        choices = [form.choice("if that is WGS 84", named, crs=_GEOGRAPHIC)] if "z" in named else []
+        choices = [form.choice("if that is WGS 84", named, crs=GEOGRAPHIC)] if "z" in named else []
     elif not doubts:
         for doubt, those in _doubts_about_axes(form, layout, columns):
             doubts.append(doubt)
