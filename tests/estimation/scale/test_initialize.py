@@ -442,6 +442,16 @@ def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
     np.testing.assert_allclose(stddev[far], 0.3, rtol=0.01)
 
 
+def test_the_prior_of_a_bias_is_told_as_it_was_given(make_survey: MakeSurvey) -> None:
+    """Errors that last make the ranges say less, so that priors weigh more beside them, and are no others."""
+    survey = make_survey(radio=NOISE, num_epochs=4)
+    log = survey.log_with(survey.log.range_m + 0.1 * np.sin(survey.log.timestamp_s / 5))
+    estimate = survey.scale("first_camera", "ABCDE", log)
+    assert estimate.errors.inflation > 1.2
+    given_m = RangeModelOptions().range_bias_stddev_m
+    np.testing.assert_allclose([each.prior_bias_stddev_m for each in estimate.anchors], given_m, rtol=1e-12)
+
+
 def no_ranges() -> RangeObservations:
     none, no, nowhere = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3))
     log = RangeLog((), none, no, ByPhoto(()), no, no, (), none, none, np.zeros(0, dtype=np.int8), none)
