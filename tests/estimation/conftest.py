@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import lap_path
 
-from rangesfm.estimation.vision_information import Observations, model_observations
+from rangesfm.estimation.vision_information import Rays, model_rays
 from rangesfm.util.geometry.poses import Poses, model_poses
 from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
@@ -35,9 +35,9 @@ def chain() -> SyntheticModel:
     )
 
 
-def poses_and_rays(model: SyntheticModel) -> tuple[Poses, Observations]:
+def poses_and_rays(model: SyntheticModel) -> tuple[Poses, Rays]:
     frame_ids = trajectory_from_reconstruction(model.reconstruction, model.timestamps_s).frame_ids
-    return model_poses(model.reconstruction, frame_ids), model_observations(model.reconstruction, frame_ids)
+    return model_poses(model.reconstruction, frame_ids), model_rays(model.reconstruction, frame_ids)
 
 
 def bent(poses: Poses, turn_deg: float, growth: float) -> tuple[Poses, Array]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.estimation.vision_information import Observations, photo_gradient, vision_information
+from rangesfm.estimation.vision_information import Rays, photo_gradient, vision_information
 from rangesfm.util.geometry.poses import Poses
 
 Array = npt.NDArray[np.float64]
@@ -33,14 +33,14 @@ class Scene:
         shifts, camera = np.array([[0.0, 0.0, 0.0], [0.3, 0.1, 0.0]]), np.arange(num) % 2
         points = rng.uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 8.0], (len(self.seen), 3))
         focal = rng.uniform(80.0, 120.0, num)
-        exact = Observations(
+        exact = Rays(
             frame, point, np.zeros((num, 2)), focal, cameras[camera], shifts[camera], points, np.arange(len(points))
         )
         rays = np.array([self.ray(exact, row, self.poses, points[point[row]]) for row in range(num)])
         self.observations = replace(exact, ray=rays - stddev * rng.normal(size=rays.shape) / focal[:, None])
 
     @staticmethod
-    def ray(observations: Observations, row: int, poses: Poses, place: Array) -> Array:
+    def ray(observations: Rays, row: int, poses: Poses, place: Array) -> Array:
         """Return the ray (2,) at which one observation would see a place in the world."""
         frame = observations.frame[row]
         in_rig = poses.world_from_rig[frame].T @ (place - poses.centers[frame])

@@ -214,7 +214,7 @@ class Known:
         problem = found.alone.problem
         parts = {part.name: part.alike for part in problem.components}
         covariance = problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
-        grouping, at = found.grouped(found.alone).grouping, np.flatnonzero(~known.is_mark)
+        grouping, at = found.alone.observed[found.kind].averages, np.flatnonzero(~known.is_mark)
         own = np.zeros((len(known), len(known)))
         for name in RECEIVERS.keys() & {*self.names}:
             own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])

@@ -15,10 +15,10 @@ from rangesfm.estimation.free_fit import GraphSolution, KeyframeGraph, local_sca
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.vision_information import (
     Loop,
-    Observations,
+    Rays,
     VisionInformation,
     costs_of_points,
-    model_observations,
+    model_rays,
     photo_gradient,
     project,
     ray_residuals,
@@ -44,7 +44,7 @@ _TOLERANCE = 0.001
 _NUM_VISIBLE_STDDEVS = 3.0
 
 
-def straighten(problem: MapProblem, rays: Observations) -> GraphSolution:
+def straighten(problem: MapProblem, rays: Rays) -> GraphSolution:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The noise is estimated again with every solution. While the drift is large, the residuals and their standard
@@ -63,7 +63,7 @@ def straighten(problem: MapProblem, rays: Observations) -> GraphSolution:
     return fit
 
 
-def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array]) -> Mapping[Block, Array]:
+def straighten_again(problem: MapProblem, rays: Rays, blocks: Mapping[Block, Array]) -> Mapping[Block, Array]:
     """Solve the keyframe graph again from a model that was refined, with known noise, and move the model, in place.
 
     New weights turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem,
@@ -82,7 +82,7 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
 
 
 def close_in_graph(
-    problem: MapProblem, known: Sequence[Measurements], rays: Observations, loops: Sequence[Loop]
+    problem: MapProblem, known: Sequence[Measurements], rays: Rays, loops: Sequence[Loop]
 ) -> MapState | None:
     """Close loops of a model that was refined, in place; None where that bends it by no more than photos just see.
 
@@ -106,9 +106,7 @@ def close_in_graph(
     return fit.state
 
 
-def _graph(
-    problem: MapProblem, rays: Observations, blocks: Mapping[Block, Array], loops: Sequence[Loop] = ()
-) -> KeyframeGraph:
+def _graph(problem: MapProblem, rays: Rays, blocks: Mapping[Block, Array], loops: Sequence[Loop] = ()) -> KeyframeGraph:
     """Set up the keyframe graph of the current model.
 
     In a refined model the measurements balance the gradient of the photos' cost. In a model of photos alone it is only
@@ -124,7 +122,7 @@ def _graph(
     return KeyframeGraph(vision.with_loops(loops, problem.frame_ids), problem.kinds, problem.held_frame, own)
 
 
-def _move(problem: MapProblem, rays: Observations, vision: VisionInformation, after: Poses) -> None:
+def _move(problem: MapProblem, rays: Rays, vision: VisionInformation, after: Poses) -> None:
     """Move the model: as a whole, which photos do not notice, or keyframe by keyframe if it bends.
 
     The full problem has the same difficulty with a part of the map that turns about a weak link as with the whole map.
@@ -198,13 +196,13 @@ def bend(metric: pycolmap.Reconstruction, steps: FrameSteps) -> None:
     frame_ids = np.array(sorted(metric.reg_frame_ids()), dtype=np.int64)
     before, (turns, shifts_m) = model_poses(metric, frame_ids), steps.at(frame_ids)
     after = Poses(before.world_from_rig @ Rotation.from_rotvec(turns).as_matrix(), before.centers + shifts_m)
-    carry_model(metric, frame_ids, model_observations(metric, frame_ids), before, after, np.ones(len(frame_ids)))
+    carry_model(metric, frame_ids, model_rays(metric, frame_ids), before, after, np.ones(len(frame_ids)))
 
 
 def carry_model(
     metric: pycolmap.Reconstruction,
     frame_ids: Indices,
-    observations: Observations,
+    rays: Rays,
     before: Poses,
     after: Poses,
     local_scale: Array,
@@ -212,11 +210,11 @@ def carry_model(
     """Move frames and points of a model in place, so that a solver that uses their arrays sees the change.
 
     Args:
-        frame_ids: (n,) ids of the frames. observations: of the model's points in these frames.
+        frame_ids: (n,) ids of the frames. rays: to the model's points in these frames.
         before, after: current and new poses of the frames.
         local_scale: (n,) growth of the map around each frame.
     """
-    points = _triangulated(observations, after, _carried(observations, before, after, local_scale))
+    points = _triangulated(rays, after, _carried(rays, before, after, local_scale))
     quaternions = Rotation.from_matrix(np.swapaxes(after.world_from_rig, 1, 2)).as_quat()
     translations = -np.einsum("nji,nj->ni", after.world_from_rig, after.centers)
     moved = np.any(after.centers != before.centers, axis=1) | np.any(
@@ -224,32 +222,32 @@ def carry_model(
     )
     for k in np.flatnonzero(moved):
         pose_of(metric.frame(int(frame_ids[k]))).params[:] = [*quaternions[k], *translations[k]]
-    for point_id, point in zip(observations.point_ids, points, strict=True):
+    for point_id, point in zip(rays.point_ids, points, strict=True):
         metric.point3D(int(point_id)).xyz[:] = point
 
 
-def _carried(observations: Observations, before: Poses, after: Poses, local_scale: Array) -> Array:
+def _carried(rays: Rays, before: Poses, after: Poses, local_scale: Array) -> Array:
     """Return the (p, 3) points, each moved rigidly with the first keyframe that sees it and scaled about it."""
-    points = observations.points.copy()
-    seen, first = np.unique(observations.point, return_index=True)
-    frame = observations.frame[first]
+    points = rays.points.copy()
+    seen, first = np.unique(rays.point, return_index=True)
+    frame = rays.frame[first]
     in_rig = np.einsum("nji,nj->ni", before.world_from_rig[frame], points[seen] - before.centers[frame])
     in_rig *= local_scale[frame][:, None]
     points[seen] = after.centers[frame] + np.einsum("nij,nj->ni", after.world_from_rig[frame], in_rig)
     return points
 
 
-def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
+def _triangulated(rays: Rays, poses: Poses, start: Array) -> Array:
     """Return the (p, 3) points that fit the rays best, by Gauss-Newton steps that are kept where they help."""
-    points, cost = start, costs_of_points(observations, poses, start)
+    points, cost = start, costs_of_points(rays, poses, start)
     for _ in range(5):  # in many more steps, points follow a camera that is out of its place, which then stays there
-        _, in_cam, derivative = project(observations, poses, points)
-        residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
+        _, in_cam, derivative = project(rays, poses, points)
+        residuals = np.nan_to_num(ray_residuals(rays, in_cam), posinf=0.0)
         root = robust_root_weights(residuals)[:, None]
-        to_rig = np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
-        to_point = to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
-        trial = points + steps_of_points(observations, root[:, :, None] * to_point, root * residuals)
-        trial_cost = costs_of_points(observations, poses, trial)
+        to_rig = np.nan_to_num(derivative) @ rays.cam_from_rig_rotation
+        to_point = to_rig @ np.swapaxes(poses.world_from_rig[rays.frame], 1, 2)
+        trial = points + steps_of_points(rays, root[:, :, None] * to_point, root * residuals)
+        trial_cost = costs_of_points(rays, poses, trial)
         points = np.where((trial_cost < cost)[:, None], trial, points)
         cost = np.fmin(trial_cost, cost)  # a point without any cost keeps its place
     return points

@@ -11,7 +11,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
-from rangesfm.estimation.vision_information import misplaced_points, model_observations
+from rangesfm.estimation.vision_information import misplaced_points, model_rays
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import (
     Bending,
@@ -124,7 +124,7 @@ def bending_of_model(
     """
     try:
         frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
-        rays = model_observations(model, frame_ids)
+        rays = model_rays(model, frame_ids)
         misplaced = rays.point_ids[misplaced_points(rays, model_poses(model, frame_ids))]
         bundle = bundle_adjustment(model, camera, options, num_threads=num_threads, left_out_ids=misplaced.tolist())
         if bundle.has_covariance:

@@ -19,9 +19,9 @@ from rangesfm.estimation.free_fit import GraphSolution
 from rangesfm.estimation.map_problem import MapProblem, equations_of
 from rangesfm.estimation.vision_information import (
     Loop,
-    Observations,
+    Rays,
     misplaced_points,
-    model_observations,
+    model_rays,
     project,
 )
 from rangesfm.measurements.kind import Block, MapState, Measurements
@@ -103,10 +103,10 @@ def _marks_in_map(problem: MapProblem) -> Iterator[MapProblem]:
     remove_marks(problem.metric, marker_ids)
 
 
-def _without_misplaced(problem: MapProblem) -> tuple[MapProblem, BundleAdjustment, Observations]:
+def _without_misplaced(problem: MapProblem) -> tuple[MapProblem, BundleAdjustment, Rays]:
     """Return the problem without the misplaced points, its bundle adjustment, and the observations of all points."""
     frame_ids = problem.frame_ids
-    rays = model_observations(problem.metric, frame_ids)
+    rays = model_rays(problem.metric, frame_ids)
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     adjustment = problem.of_photos(problem.options.max_num_iterations)
@@ -147,7 +147,7 @@ def refine_with_loops(
     return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)), with_equations=with_equations)
 
 
-def _just_visible_m(rays: Observations, poses: Poses) -> float:
+def _just_visible_m(rays: Rays, poses: Poses) -> float:
     """Return the movement of a camera that moves a feature at median depth by its standard deviation."""
     _, in_cam, _ = project(rays, poses, rays.points)
     return float(np.median(np.abs(in_cam[:, 2]) / rays.root_information))
@@ -161,7 +161,7 @@ def _adjusted(
     runs, num_left = list[SolverRun](), problem.options.max_num_iterations
     for num_round in range(_MAX_NUM_ROUNDS):
         if num_round:
-            rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(adjustment.pixel_stddev)
+            rays = model_rays(problem.metric, problem.frame_ids).with_pixel_stddev(adjustment.pixel_stddev)
             blocks = straighten_again(problem, rays, blocks)
             adjustment = problem.of_photos(num_left)
         added = problem.add_to(adjustment, blocks)

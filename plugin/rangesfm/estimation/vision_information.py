@@ -45,7 +45,7 @@ _MAX_DEPTH_RATIO = 10.0
 
 
 @dataclass(frozen=True)
-class Observations:
+class Rays:
     """n observations of p points as rays, ordered by point and keyframe; they do not need a camera model.
 
     Attributes:
@@ -66,11 +66,11 @@ class Observations:
     points: Array
     point_ids: Indices
 
-    def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
+    def with_pixel_stddev(self, pixel_stddev: float) -> Rays:
         """Return a copy with another standard deviation of feature coordinates, in units of the present one."""
         return replace(self, root_information=self.root_information / pixel_stddev)
 
-    def subset(self, rows: Indices) -> Observations:
+    def subset(self, rows: Indices) -> Rays:
         """Return some of the observations; all points stay, even those that are no longer seen."""
         of_each = ("frame", "point", "ray", "root_information", "cam_from_rig_rotation", "cam_from_rig_translation")
         return replace(self, **{name: getattr(self, name)[rows] for name in of_each})
@@ -139,11 +139,11 @@ class VisionInformation:
         )
 
 
-def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:
+def model_rays(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Rays:
     """Return all observations of 3-D points in these frames, with a standard deviation of one pixel.
 
     Raises:
-        SolverError: there are no observations.
+        SolverError: there are no rays.
     """
     index_of_frame = {int(frame_id): index for index, frame_id in enumerate(frame_ids)}
     point_ids = np.array(sorted(metric.points3D.keys()), dtype=np.int64)
@@ -173,45 +173,45 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
         np.concatenate(column) for column in zip(*columns, strict=True)
     )
     points = np.array([metric.point3D(int(point_id)).xyz for point_id in point_ids])
-    all_of_them = Observations(frame, point, ray, root_information, rotation, translation, points, point_ids)
+    all_of_them = Rays(frame, point, ray, root_information, rotation, translation, points, point_ids)
     valid = np.isfinite(ray).all(axis=1)
     return all_of_them.subset(np.flatnonzero(valid)[np.lexsort((frame[valid], point[valid]))])
 
 
-def project(observations: Observations, poses: Poses, points: Array) -> tuple[Array, Array, Array]:
+def project(rays: Rays, poses: Poses, points: Array) -> tuple[Array, Array, Array]:
     """Return (n, 3) points in the rig, (n, 3) in the camera, and (n, 2, 3) weighted derivatives of rays by these."""
-    frame = observations.frame
-    in_rig = np.einsum("nji,nj->ni", poses.world_from_rig[frame], points[observations.point] - poses.centers[frame])
-    in_cam = np.einsum("nij,nj->ni", observations.cam_from_rig_rotation, in_rig)
-    in_cam = in_cam + observations.cam_from_rig_translation
+    frame = rays.frame
+    in_rig = np.einsum("nji,nj->ni", poses.world_from_rig[frame], points[rays.point] - poses.centers[frame])
+    in_cam = np.einsum("nij,nj->ni", rays.cam_from_rig_rotation, in_rig)
+    in_cam = in_cam + rays.cam_from_rig_translation
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse_depth = 1 / in_cam[:, 2]
     derivative = np.zeros((len(frame), 2, 3))
     derivative[:, 0, 0] = derivative[:, 1, 1] = inverse_depth
     derivative[:, :, 2] = -in_cam[:, :2] * inverse_depth[:, None] ** 2
-    return in_rig, in_cam, derivative * observations.root_information[:, None, None]
+    return in_rig, in_cam, derivative * rays.root_information[:, None, None]
 
 
-def misplaced_points(observations: Observations, poses: Poses) -> Mask:
+def misplaced_points(rays: Rays, poses: Poses) -> Mask:
     """Return a (p,) mask of points in or behind a camera that sees them, or far nearer to it than to another.
 
     Mappers sometimes make such points from wrong matches. A residual depends on the point's position over its depth, so
     near zero depth a step of centimetres changes it without bound. One such point in ten thousand makes a solver take
     small steps only, which end anywhere and look like convergence.
     """
-    depth = project(observations, poses, observations.points)[1][:, 2]
-    farthest = np.zeros(len(observations.points))
-    np.maximum.at(farthest, observations.point, depth)
-    least = np.maximum(_MIN_DEPTH * np.median(np.abs(depth)), farthest[observations.point] / _MAX_DEPTH_RATIO)
-    misplaced: Mask = np.zeros(len(observations.points), dtype=np.bool_)
-    misplaced[observations.point[~(depth >= least)]] = True
+    depth = project(rays, poses, rays.points)[1][:, 2]
+    farthest = np.zeros(len(rays.points))
+    np.maximum.at(farthest, rays.point, depth)
+    least = np.maximum(_MIN_DEPTH * np.median(np.abs(depth)), farthest[rays.point] / _MAX_DEPTH_RATIO)
+    misplaced: Mask = np.zeros(len(rays.points), dtype=np.bool_)
+    misplaced[rays.point[~(depth >= least)]] = True
     return misplaced
 
 
-def ray_residuals(observations: Observations, in_cam: Array) -> Array:
+def ray_residuals(rays: Rays, in_cam: Array) -> Array:
     """Return the (n, 2) residuals in standard deviations; infinite behind the camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        residuals = (in_cam[:, :2] / in_cam[:, 2:] - observations.ray) * observations.root_information[:, None]
+        residuals = (in_cam[:, :2] / in_cam[:, 2:] - rays.ray) * rays.root_information[:, None]
     return np.where(in_cam[:, 2:] > 0, residuals, np.inf)
 
 
@@ -220,21 +220,21 @@ def robust_root_weights(residuals: Array) -> Array:
     return np.sqrt(_LOSS.weights(np.linalg.norm(residuals, axis=1)))
 
 
-def costs_of_points(observations: Observations, poses: Poses, points: Array) -> Array:
+def costs_of_points(rays: Rays, poses: Poses, points: Array) -> Array:
     """Return the (p,) robust cost of each point; infinite for a point behind a camera that sees it."""
-    residuals = ray_residuals(observations, project(observations, poses, points)[1])
+    residuals = ray_residuals(rays, project(rays, poses, points)[1])
     rho = _LOSS.rho(np.sum(residuals**2, axis=1))[0]
-    return np.bincount(observations.point, rho, len(points)).astype(np.float64)
+    return np.bincount(rays.point, rho, len(points)).astype(np.float64)
 
 
-def steps_of_points(observations: Observations, to_point: Array, residuals: Array) -> Array:
+def steps_of_points(rays: Rays, to_point: Array, residuals: Array) -> Array:
     """Return the (p, 3) Gauss-Newton steps of all points.
 
     Args:
         to_point: (n, 2, 3) derivatives of the (n, 2) residuals by the points.
     """
-    n, num_points = len(residuals), len(observations.points)
-    adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
+    n, num_points = len(residuals), len(rays.points)
+    adder = sparse.csr_array((np.ones(n), (rays.point, np.arange(n))), shape=(num_points, n))
     information = (adder @ np.einsum("nai,naj->nij", to_point, to_point).reshape(n, 9)).reshape(-1, 3, 3)
     slope = adder @ np.einsum("nai,na->ni", to_point, residuals)
     return -np.linalg.solve(_regular(information), slope[:, :, None])[:, :, 0]
@@ -246,15 +246,15 @@ def _regular(information: Array) -> Array:
     return np.asarray(information + ridge[:, None, None] * np.eye(3))
 
 
-def vision_information(observations: Observations, poses: Poses) -> VisionInformation:
+def vision_information(rays: Rays, poses: Poses) -> VisionInformation:
     """Eliminate the points of a map and return the information on its relative poses."""
-    in_rig, in_cam, derivative = project(observations, poses, observations.points)
-    root_weight = robust_root_weights(ray_residuals(observations, in_cam))
-    to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
-    pieces, share = _thinned(_pieces(observations.point), len(poses))
+    in_rig, in_cam, derivative = project(rays, poses, rays.points)
+    root_weight = robust_root_weights(ray_residuals(rays, in_cam))
+    to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ rays.cam_from_rig_rotation
+    pieces, share = _thinned(_pieces(rays.point), len(poses))
     n = len(poses)
     batches = [batch for rows in pieces for batch in np.array_split(rows, max(len(rows) // 500, 1))]
-    added = side_by_side(lambda rows: _added(*_eliminate(rows, observations.frame, in_rig, to_rig, poses)), batches)
+    added = side_by_side(lambda rows: _added(*_eliminate(rows, rays.frame, in_rig, to_rig, poses)), batches)
     key = np.unique(np.concatenate([some for some, _ in added]))
     values = np.zeros((len(key), 6, 6))
     for some, blocks in added:
@@ -268,23 +268,23 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     return VisionInformation(poses, pairs // n, pairs % n, turn, shift, matrix, np.zeros(size), len(pairs))
 
 
-def photo_gradient(observations: Observations, poses: Poses) -> Array:
+def photo_gradient(rays: Rays, poses: Poses) -> Array:
     """Return the (6 n,) gradient of half the photos' sum of squares by the poses, where the points follow them.
 
     The numbers of a pose are a turn in its own frame and a shift. In a refined map the ranges balance this gradient.
     """
-    in_rig, in_cam, derivative = project(observations, poses, observations.points)
-    residuals = ray_residuals(observations, in_cam)
+    in_rig, in_cam, derivative = project(rays, poses, rays.points)
+    residuals = ray_residuals(rays, in_cam)
     fits = (in_cam[:, 2] > 0) & (np.linalg.norm(residuals, axis=1) < _FARTHEST)
     residuals = np.where(fits[:, None], residuals, 0.0)
-    to_rig = np.where(fits[:, None, None], derivative, 0.0) @ observations.cam_from_rig_rotation
-    rig_from_world = np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
+    to_rig = np.where(fits[:, None, None], derivative, 0.0) @ rays.cam_from_rig_rotation
+    rig_from_world = np.swapaxes(poses.world_from_rig[rays.frame], 1, 2)
     to_point = to_rig @ rig_from_world
-    step = steps_of_points(observations, to_point, residuals)
-    residuals = residuals + (to_point @ step[observations.point, :, None])[:, :, 0]
+    step = steps_of_points(rays, to_point, residuals)
+    residuals = residuals + (to_point @ step[rays.point, :, None])[:, :, 0]
     to_pose = np.concatenate([to_rig @ cross_matrices(in_rig), -to_point], axis=2)
     gradient = np.zeros((len(poses), 6))
-    np.add.at(gradient, observations.frame, np.einsum("nai,na->ni", to_pose, residuals))
+    np.add.at(gradient, rays.frame, np.einsum("nai,na->ni", to_pose, residuals))
     return gradient.ravel()
 
 

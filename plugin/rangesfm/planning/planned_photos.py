@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information
+from rangesfm.estimation.vision_information import Rays, VisionInformation, vision_information
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, locate_points
@@ -81,7 +81,7 @@ class PlannedPhotos(Options, table="photos"):
             raise GeometryError("[photos] no two photos see the same point: expected a larger seen_m or photo_rate_hz")
         return vision_information(observations, Poses(path.world_from_cam, path.centers))
 
-    def observations(self, path: Trajectory) -> Observations:
+    def observations(self, path: Trajectory) -> Rays:
         """Simulate observations, without errors, of points that fill each photo of a path.
 
         The points are uniform over the photo and over the logarithm of depth. They are few, so that each may stand for
@@ -185,12 +185,12 @@ class PlannedPhotos(Options, table="photos"):
         for row in found:
             yield photos[row & _in_runs(row, self.num_photos_of_point)]
 
-    def _as_rays(self, path: Trajectory, points: Array, seen_by: list[Indices], num_alike: float) -> Observations:
+    def _as_rays(self, path: Trajectory, points: Array, seen_by: list[Indices], num_alike: float) -> Rays:
         point = np.repeat(np.arange(len(points)), [len(by) for by in seen_by])
         frame = np.concatenate([*seen_by, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         in_cam = np.einsum("nji,nj->ni", path.world_from_cam[frame], points[point] - path.centers[frame])
         root_information = np.sqrt(num_alike) / (self.feature_stddev * 2 * self._half_width)
-        return Observations(
+        return Rays(
             frame,
             point,
             in_cam[:, :2] / in_cam[:, 2:],

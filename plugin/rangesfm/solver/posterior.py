@@ -7,13 +7,14 @@ its own; the bending of the map is that of all.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
@@ -38,6 +39,7 @@ class Observations(LinearMap):
         components: of their errors, without the bending of the map.
         alone_m2: (c, c) covariance as if each single one erred independently.
         is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
+        averages: (c, m) weights of single numbers that were measured, with a sum of 1 in each, where it matters which.
     """
 
     kind: str
@@ -45,6 +47,7 @@ class Observations(LinearMap):
     components: tuple[Component, ...]
     alone_m2: Array
     is_used: Mask
+    averages: csr_array = field(default_factory=lambda: csr_array((0, 0)))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
@@ -23,7 +23,6 @@ from rangesfm.measurements.positions.words import FRAME
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.solver.noise import Component, independent_unknowns
-from rangesfm.solver.posterior import Observations
 from rangesfm.util.geometry.numerics import UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M
 from rangesfm.util.geometry.similarity import Similarity, align_points, path_shape, similarity_motions
@@ -39,17 +38,6 @@ _SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
 _MAX_NUM_TRIPLES = 300
 # Number of times of a group over which its correlation with others is averaged.
 _NUM_WITHIN = 8
-
-
-@dataclass(frozen=True)
-class GroupedPositions(Observations):
-    """Known positions in groups, three coordinates each, about a similarity.
-
-    Attributes:
-        grouping: (3 g, 3 k) sparse weights of the positions in the groups.
-    """
-
-    grouping: csr_array = field(kw_only=True)
 
 
 def determine(known: KnownPositions, used: Mask) -> bool:
@@ -196,7 +184,7 @@ def components_of(
     time, or at some place: by what of these errors a similarity does not take up.
 
     Args:
-        grouping: (3 g, 3 k) as of ``GroupedPositions``. stddev_m: (k,) of a coordinate, where none is given.
+        grouping: (3 g, 3 k) weights of positions in groups. stddev_m: (k,) of a coordinate, where none is given.
         surveyed: what the positions were given as. design: (3 g, 7) derivatives. used: (3 g,) that take part.
     """
     components = tuple(_alone(known, similarity, grouping, stddev_m, surveyed))

@@ -29,7 +29,6 @@ from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import AntennaPositions, MarkedPositions
 from rangesfm.measurements.positions.known_positions import LOOK_AGAIN, MIN_NUM_POSITIONS, KnownPositions
 from rangesfm.measurements.positions.position_fit import (
-    GroupedPositions,
     at_point,
     components_of,
     design_of_positions,
@@ -47,7 +46,7 @@ from rangesfm.options import LEVER_ARM_M, RefineOptions
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
-from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
+from rangesfm.solver.posterior import Observations, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY
@@ -168,7 +167,7 @@ class PositionScale(KindOnMap):
         problem, used = self.alone.problem, self.alone.problem.is_used
         linear, noise = problem.among(used)
         as_independent, _ = linear.solved(problem.alone_m2[np.ix_(used, used)]).gains
-        grouping = self.grouped(self.alone).grouping
+        grouping = self.alone.observed[POSITIONS].averages
         is_antenna = np.asarray(abs(grouping) @ np.repeat(~self.known.is_mark, 3) > 0)[used]
         effects = noise.effects(np.where(is_antenna, as_independent[0], 0.0))
         of_parts = {name: size for name, size in effects.items() if name.startswith(POSITIONS)}
@@ -208,7 +207,7 @@ class PositionScale(KindOnMap):
 
     def observed(
         self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
-    ) -> GroupedPositions:
+    ) -> Observations:
         """Linearise the positions about a placement; an antenna has at most ``max_num`` observations."""
         del in_site
         known, similarity = self.known, placed
@@ -217,7 +216,7 @@ class PositionScale(KindOnMap):
         design = grouping @ design_of_positions(known, similarity, self.bending.path)
         variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
         weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
-        return GroupedPositions(
+        return Observations(
             kind=POSITIONS,
             columns=Columns.of_whole(7),
             design=design,
@@ -226,7 +225,7 @@ class PositionScale(KindOnMap):
             components=components_of(known, similarity, grouping, self.stddev_m, self.surveyed, design, used),
             alone_m2=weighed,
             is_used=used,
-            grouping=grouping,
+            averages=grouping,
         )
 
     def stddevs_m(self, on_map: JointMap) -> Array:
@@ -275,15 +274,9 @@ class PositionScale(KindOnMap):
             placed = on_map.path, on_map.estimate
             yield AntennaPositions.on_map(known, others, stddev_m[others], *placed, track, options)
 
-    def grouped(self, on_map: JointMap) -> GroupedPositions:
-        """Return the groups of the positions on a map."""
-        observed = on_map.observed[POSITIONS]
-        assert isinstance(observed, GroupedPositions), "positions come in groups"
-        return observed
-
     def columns_of(self, on_map: JointMap, of_positions: Array) -> Array:
         """Return the columns (c, m) of a mistake in a map's problem that makes the positions too large by (3 k, m)."""
-        return -on_map.columns(POSITIONS, self.grouped(on_map).grouping @ of_positions)
+        return -on_map.columns(POSITIONS, on_map.observed[POSITIONS].averages @ of_positions)
 
     @property
     def names_left_out(self) -> list[str]:
