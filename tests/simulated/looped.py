@@ -176,10 +176,10 @@ class ScaledMap:
         again, _ = refine_with_ranges(
             self.scaled if refined is None else refined,
             self.trajectory,
-            estimate.observations,
+            estimate.ranges.observations,
             estimate.metric_from_sfm,
-            estimate.anchors,
-            estimate.errors,
+            estimate.ranges.anchors,
+            estimate.ranges.errors,
             tag_in_cam_m=TAG_IN_CAM_M,
             first_pose_is_fixed=self.survey.is_in_first_camera,
             camera=CameraOptions(refine_intrinsics=False),

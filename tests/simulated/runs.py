@@ -97,7 +97,7 @@ def run(survey: MadeSurvey, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(survey, None, None, refusal=str(error))
-    ranges, on_map = find_kind(estimate.kinds, RangeScale), estimate.on_map
+    ranges, on_map = find_kind(estimate.on_map.kinds, RangeScale), estimate.on_map
     assert ranges is not None
     return Run(survey, estimate.where_bent(options), ranges.tests(on_map, {}), ranges.on(on_map))
 

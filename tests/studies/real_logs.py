@@ -210,7 +210,7 @@ def one_survey(
 
 def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
     """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
-    ranges, on_map = find_kind(found.kinds, RangeScale), found.on_map
+    ranges, on_map = find_kind(found.on_map.kinds, RangeScale), found.on_map
     assert ranges is not None
     return found.where_bent(options), [cause.words for cause in ranges.tests(on_map, {}).causes]
 

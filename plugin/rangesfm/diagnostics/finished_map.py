@@ -16,7 +16,7 @@ from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.diagnostics.place import Place, by_similarity, place_in_words
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.with_ranges import RefinedRanges, RefineSummary
+from rangesfm.estimation.with_ranges import RangesInMap, RefineSummary
 from rangesfm.measurements.kind import Doubt
 from rangesfm.util.geometry.map_errors import MapErrors
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -93,7 +93,7 @@ def place_of_map(
     bent_m2 = np.square(bent_by_m) if not errors.are_known and len(bent_by_m) else 0.0
     keyframes_m = np.sqrt(keyframes_m2 + bent_m2)
     worst_m = float(keyframes_m.max())
-    surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
+    surveyed = [a.prior_position_m for a in estimate.ranges.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     in_words, is_wide = place_in_words(stddevs, worst_m, size_m)
     loose = _loose_ones(path, keyframes_m) if is_wide else ()
@@ -182,11 +182,11 @@ def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
         yield f"the points moved away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
 
 
-def _apart_from_ranges(estimate: ScaleEstimate, ranges: RefinedRanges, path_m: Array) -> Iterator[str]:
+def _apart_from_ranges(estimate: ScaleEstimate, ranges: RangesInMap, path_m: Array) -> Iterator[str]:
     """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
     if np.isfinite(old_m := estimate.ranges.median_off_m):
-        new_m = float(np.nanmedian(np.abs(ranges.predicted_m - ranges.observations.log.range_m)))
-        if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
+        new_m = float(np.nanmedian(np.abs(ranges.residuals_m)))
+        if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.ranges.noise_stddev_m):
             yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"
     size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
     for anchor in ranges.anchors:

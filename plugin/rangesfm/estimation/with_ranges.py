@@ -107,15 +107,14 @@ def refine_with_ranges(
 
 
 @dataclass(frozen=True)
-class RefinedRanges:
-    """The n ranges of a log as a refined map has them.
+class RangesInMap:
+    """The n ranges of a log as a metric map has them, scaled or refined.
 
     Attributes:
-        observations: with status by the final weight of each range.
-        errors: of all ranges, as weighted at the end.
-        anchors: refined positions and biases, with standard deviations if there is a covariance.
+        observations: with status by the weight of each range.
+        errors: of all ranges, as weighted.
+        anchors: positions and biases, with standard deviations; of a refined map these need its covariance.
         predicted_m: (n,) ranges predicted by the map; NaN without a place.
-        weights: (n,) robust weights in [0, 1]; NaN without a place.
         tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
         time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
         short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
@@ -126,10 +125,19 @@ class RefinedRanges:
     errors: RangeErrors
     anchors: tuple[AnchorEstimate, ...]
     predicted_m: Array
-    weights: Array
     tags_in_cam_m: Array
-    time_shift_s: float | None
-    short_range_error_m: float | None
+    time_shift_s: float | None = None
+    short_range_error_m: float | None = None
+
+    @property
+    def residuals_m(self) -> Array:
+        """(n,) predicted minus measured ranges, metres; NaN without a place."""
+        return self.predicted_m - self.observations.log.range_m
+
+    @property
+    def weights(self) -> Array:
+        """(n,) robust weights in [0, 1]; NaN without a place."""
+        return self.errors.robust_weights(self.residuals_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +161,7 @@ class RefineSummary(SolverRun):
     reprojection_rms_px: float
     pixel_stddev: float
     misfits: tuple[Doubt, ...]
-    ranges: RefinedRanges
+    ranges: RangesInMap
     covariance: MapErrors
     bending_factor: float
 
@@ -188,7 +196,7 @@ def summarize(rest: MapAtRest, covariance: MapErrors, bending_factor: float) -> 
 
 def refined_ranges(
     rest: MapAtRest, state: MapState, covariance: MapErrors, moved: Similarity = IDENTITY
-) -> RefinedRanges:
+) -> RangesInMap:
     """Return the ranges of a log as a map has them that was at rest.
 
     Args:
@@ -199,16 +207,13 @@ def refined_ranges(
     anchors = tuple(anchor.mirror_moved(moved) for anchor in ranges.anchors)
     rows, log = ranges.rows, ranges.observations.log
     state = replace(state, blocks={**ranges.blocks, **state.blocks})
-    predicted_m = ranges.predicted_m(state)
-    weights, status = np.full(len(log), np.nan), ranges.observations.status.copy()
-    weights[rows] = ranges.errors.robust_weights((predicted_m - log.range_m)[rows])
-    status[rows] = status_by_weight(weights[rows])
-    return RefinedRanges(
+    predicted_m, status = ranges.predicted_m(state), ranges.observations.status.copy()
+    status[rows] = status_by_weight(ranges.errors.robust_weights((predicted_m - log.range_m)[rows]))
+    return RangesInMap(
         observations=replace(ranges.observations, status=status),
         errors=ranges.errors.spread(rows, len(log)),
         anchors=_with_stddevs(anchors_at(anchors, state.blocks), covariance),
         predicted_m=predicted_m,
-        weights=weights,
         tags_in_cam_m=ranges.arms_m(state),
         time_shift_s=ranges.estimated(state, CLOCK),
         short_range_error_m=ranges.estimated(state, SHORT),

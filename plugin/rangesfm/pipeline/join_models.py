@@ -253,7 +253,7 @@ def _scale_alone(run: SurveyRun, first: PathOfModel, second: PathOfModel, tie: T
             estimate = scaled_alone(run, path, has_first_camera=False)
         except GeometryError:
             continue
-        return estimate.value / units, float(np.nanmedian(estimate.errors.stddev_m))
+        return estimate.value / units, float(np.nanmedian(estimate.ranges.errors.stddev_m))
     return None
 
 

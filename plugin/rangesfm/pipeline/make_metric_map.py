@@ -105,7 +105,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, bending: MapBending, *, i
         raise _refused_with_cause(error, run, path, bending) from None
     if not is_a_start:
         estimate = estimate.where_bent(survey.scale)
-    scaled, kept = rescale(path.sfm, estimate.metric_from_sfm), without_contradicted(inputs, estimate.kinds)
+    scaled, kept = rescale(path.sfm, estimate.metric_from_sfm), without_contradicted(inputs, estimate.on_map.kinds)
     return MetricResult(path, kept, estimate, scaled, by_rivals(run, path, estimate))
 
 

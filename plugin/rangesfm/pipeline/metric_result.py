@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.place import Place
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.with_ranges import RefinedRanges, RefineSummary
+from rangesfm.estimation.with_ranges import RangesInMap, RefineSummary
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.measurements.kind import Doubt, Measurements
 from rangesfm.measurements.mistakes import MistakeTests
@@ -135,10 +136,17 @@ class MetricResult:
         """Return the measurements on that map."""
         return self.all_measured.kinds
 
+    @cached_property
+    def scaled_ranges(self) -> RangesInMap:
+        """The ranges as the scaled map has them."""
+        of = self.estimate.ranges
+        predicted_m = of.predicted_m(self.estimate.metric_from_sfm)
+        return RangesInMap(of.observations, of.errors, of.anchors, predicted_m, self.inputs.tag_in_cam_m)
+
     @property
-    def ranges(self) -> ScaleEstimate | RefinedRanges:
+    def ranges(self) -> RangesInMap:
         """Return the ranges as the final map has them."""
-        return self.estimate if self.kept is None else self.kept.ranges
+        return self.scaled_ranges if self.kept is None else self.kept.ranges
 
     @property
     def anchors(self) -> tuple[AnchorEstimate, ...]:
@@ -148,11 +156,6 @@ class MetricResult:
     def observations(self) -> RangeObservations:
         """Return the ranges with their final status."""
         return self.ranges.observations
-
-    @property
-    def residuals_m(self) -> Array:
-        """Return predicted minus measured ranges by the final model, (n,) metres."""
-        return self.ranges.predicted_m - self.observations.log.range_m
 
     @property
     def center_covariance_m2(self) -> dict[str, Array]:
@@ -196,7 +199,7 @@ class MetricResult:
             )
         return replace(
             self,
-            estimate=moved.with_anchors(tuple(each.moved(shift) for each in estimate.anchors)),
+            estimate=moved.with_anchors(tuple(each.moved(shift) for each in estimate.ranges.anchors)),
             scaled=rescale(self.scaled, shift),
             inputs=replace(self.inputs, positions=self.inputs.positions.moved(offset_m)),
             refined=refined,

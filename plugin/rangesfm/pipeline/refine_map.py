@@ -155,7 +155,7 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
         return metric
     estimate, refined, at = start.estimate, metric.kept, metric.kept.on_map
     for sides in (sides for each in at.kinds for sides in each.sides(at)):
-        estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
+        estimate = estimate.with_anchors(sides.applied_to(estimate.ranges.anchors))
         if sides.has_crossed:
             again = refine_map(run, replace(start, estimate=estimate))
             return metric if again.kept is None else again
@@ -174,7 +174,7 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory) -> MapBending:
 
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap:
     """Return a map at rest with all that is measured in it."""
-    model, before = rest.problem.metric, metric.estimate.kinds
+    model, before = rest.problem.metric, metric.estimate.on_map.kinds
     path = metric.trajectory.as_in(model)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale

@@ -114,7 +114,7 @@ def _ranges(found: MetricResult) -> entries.RangesEntry:
     kind, used = found.observations.log.kind, np.isin(found.observations.status, USED)
 
     def residuals(rows: Mask) -> dict[str, Any]:
-        chosen = found.residuals_m[used & rows]
+        chosen = found.ranges.residuals_m[used & rows]
         nums = {"num": rows.sum(), "num_used": (used & rows).sum(), "num_rejected": (~used & rows).sum()}
         return {**nums, "rms_m": rms(chosen), "median_abs_m": median(np.abs(chosen))}
 
@@ -132,7 +132,7 @@ def _check_ranges(found: MetricResult) -> entries.CheckRangesEntry:
     held_out = found.observations.status == RangeStatus.CHECK
 
     def residuals(rows: Mask) -> dict[str, Any]:
-        chosen = found.residuals_m[rows & np.isfinite(found.residuals_m)]
+        chosen = found.ranges.residuals_m[rows & np.isfinite(found.ranges.residuals_m)]
         return {"num": len(chosen), "rms_m": rms(chosen), "median_m": median(chosen)}
 
     per_anchor = {id_: residuals(rows) for id_, rows in _by_anchor(found, held_out) if rows.any()}
@@ -299,18 +299,19 @@ def _tables_of_scale(estimate: ScaleEstimate, path: Trajectory) -> Iterator[Tabl
     Args:
         path: of the unscaled model.
     """
-    observations, log, placed = estimate.observations, estimate.observations.log, estimate.metric_from_sfm
-    anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
-    rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
+    ranges, placed = estimate.ranges, estimate.metric_from_sfm
+    observations, log = ranges.observations, ranges.observations.log
+    anchors = np.array([anchor.position_m for anchor in ranges.anchors], dtype=np.float64)[log.anchor_index]
+    rows = np.flatnonzero(np.isfinite(ranges.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
     tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
-    table = estimate.two_candidate
+    table = ranges.two_candidate
     seen, duplets = (rows[:0], np.zeros((0, 2))) if table is None else (table.rows, table.duplets)
     yield ScaleCandidates(log.timestamp_s[seen], tuple(log.anchor_ids[k] for k in log.anchor_index[seen]), *duplets.T)
     # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
     held = path.centers.mean(axis=0) if estimate.frame == "site" else path.centers[0]
     centers, anchor_m = (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
-    bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
-    tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
+    bias = np.array([anchor.range_bias_m for anchor in ranges.anchors])[log.anchor_index[rows]]
+    tolerance = SIGNIFICANT_STDDEVS * ranges.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
     # From a third of the estimate to three times it.
     scales = placed.scale * np.geomspace(1 / 3, 3, 601)
@@ -337,9 +338,9 @@ def ranges_as_used(found: MetricResult) -> RangesAsUsed:
         keyframe_before=tuple(names[i] for i in observations.before),
         keyframe_after=tuple(names[i] for i in observations.after),
         weight=np.where(observations.before >= 0, observations.fraction, np.nan),
-        predicted_scaled_m=found.estimate.predicted_m,
+        predicted_scaled_m=found.scaled_ranges.predicted_m,
         predicted_refined_m=unknown if found.kept is None else found.kept.ranges.predicted_m,
-        residual_m=found.residuals_m,
+        residual_m=found.ranges.residuals_m,
         robust_weight=np.where(has_say, found.ranges.weights, np.nan),
         status=tuple(labels[status] for status in observations.status.tolist()),
     )

@@ -87,6 +87,11 @@ class ScaleByKindEntry(Record):
     stddev: NumberOrNull
 
 
+def _of_ranges(key: str, *path: str) -> AliasChoices:
+    """Return where a number is found: under its key, or in what an estimate says of the ranges, as there by default."""
+    return AliasChoices(key, AliasPath("ranges", *(path or (key,))))
+
+
 class ScaleEntry(Record):
     """The scale in metres per unit of the unscaled model, and how reliable it is; see ScaleEstimate."""
 
@@ -95,24 +100,21 @@ class ScaleEntry(Record):
     stddev_empirical: NumberOrNull
     interval_95: IntervalOrNull
     relative_stddev: RelativeStddevEntry = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
-    error_stddevs: dict[Text, Number] = Field(
-        default_factory=dict,
-        validation_alias=AliasChoices("error_stddevs", AliasPath("ranges", "error_stddevs")),
-    )
+    error_stddevs: dict[Text, Number] = Field(default_factory=dict, validation_alias=_of_ranges("error_stddevs"))
     """Learnt standard deviations of the components of the range errors: metres (slope: fraction of the distance)."""
     method: Text
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
     advice: tuple[Text, ...]
-    sensitivity: ScaleSensitivity
-    per_anchor: dict[Text, NumberOrNull]
-    range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
+    sensitivity: ScaleSensitivity = Field(validation_alias=_of_ranges("sensitivity"))
+    per_anchor: dict[Text, NumberOrNull] = Field(validation_alias=_of_ranges("per_anchor"))
+    range_noise_stddev_m: NumberOrNull = Field(validation_alias=_of_ranges("range_noise_stddev_m", "noise_stddev_m"))
     """Standard deviation of a range about the scaled map, all its errors together. (The test "range noise" compares
     each range with those right before and after, which have the same lasting errors.)"""
     correlation_inflation: NumberOrNull = Field(
-        validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
+        validation_alias=_of_ranges("correlation_inflation", "errors", "inflation")
     )
-    two_candidate: TwoCandidateEntry | None
+    two_candidate: TwoCandidateEntry | None = Field(validation_alias=_of_ranges("two_candidate"))
     by_kind: dict[Text, ScaleByKindEntry] = Field(default_factory=dict)
 
     @property

@@ -196,6 +196,6 @@ def measured_in_map(
     markers = tape.end_markers | {name: of for kind in on_map.kinds for name, of in kind.markers.items()}
     points = NamedPoints.in_model(model, markers, ranges.placed_anchors, path.frame_ids)
     of_kinds = (each for kind in on_map.kinds for each in kind.measurements(on_map, points, survey.refine))
-    upward = upward_by(estimate.kinds, gravity) if estimate.frame == "site" else None
+    upward = upward_by(estimate.on_map.kinds, gravity) if estimate.frame == "site" else None
     levelled = () if upward is None else (UpwardDirection(upward),)
     return (*measured_by_radio(ranges, points), *taped_lengths(tape, points), *of_kinds, *levelled)

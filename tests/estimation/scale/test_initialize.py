@@ -96,7 +96,7 @@ class TestWithoutNoise:
         centers = survey.trajectory.centers
         np.testing.assert_allclose(estimate.metric_from_sfm.apply(centers), truth.apply(centers), atol=1e-6)
         from_site = survey.frame_from_site(estimate.frame)
-        for anchor in estimate.anchors:
+        for anchor in estimate.ranges.anchors:
             position = from_site.apply(survey.anchors_m[anchor.anchor_id])
             places = [place for place in (anchor.position_m, anchor.mirror_position_m) if place is not None]
             assert min(float(np.linalg.norm(place - position)) for place in places) < 1e-5
@@ -104,29 +104,29 @@ class TestWithoutNoise:
     def test_each_anchor_alone_gives_the_same_scale(self, make_survey: MakeSurvey) -> None:
         survey = make_survey()
         estimate = survey.scale("first_camera", "ABCDE")
-        assert estimate.per_anchor.keys() == survey.anchors_m.keys()
-        np.testing.assert_allclose(list(estimate.per_anchor.values()), survey.site_from_sfm.scale, rtol=1e-6)
+        assert estimate.ranges.per_anchor.keys() == survey.anchors_m.keys()
+        np.testing.assert_allclose(list(estimate.ranges.per_anchor.values()), survey.site_from_sfm.scale, rtol=1e-6)
 
     def test_the_papers_method_takes_its_own_scale(self, make_survey: MakeSurvey) -> None:
         towards = np.stack([np.linspace(0.0, 4.0, 40), np.sin(np.linspace(0.0, 3.0, 40)), np.full(40, 1.6)], axis=1)
         survey = make_survey(centers_m=towards, anchors_m={"A": (12.0, 1.0, 2.0)})
         estimate = survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate"))
         assert estimate.method == "two-candidate"
-        assert estimate.two_candidate is not None
-        assert estimate.value == estimate.two_candidate.scale
+        assert estimate.ranges.two_candidate is not None
+        assert estimate.value == estimate.ranges.two_candidate.scale
         assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
 
     def test_the_papers_scale_says_nothing_of_its_error(self, make_survey: MakeSurvey) -> None:
         survey = make_survey(centers_m=on_a_sphere(), anchors_m={"A": (12.0, 1.0, 2.0)}, radio=NOISE)
         robust = survey.scale("first_camera", "A")
-        table = known(robust.two_candidate)
+        table = known(robust.ranges.two_candidate)
         assert not robust.interval_95[0] < table.scale < robust.interval_95[1]
         with pytest.raises(GeometryError, match=f"two-candidate gives {table.scale:.4g} m per unit, outside the 95 %"):
             survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate"))
         paper = survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate-unchecked"))
         assert (paper.method, paper.value, paper.verdict) == ("two-candidate", table.scale, "doubtful")
         assert paper.stddev_empirical == paper.stddev_formal == np.inf
-        assert (paper.placement, paper.per_anchor, paper.by_kind) == (None, {}, {})
+        assert (paper.placement, paper.ranges.per_anchor, paper.by_kind) == (None, {}, {})
 
 
 class TestWithOutliers:
@@ -147,12 +147,12 @@ class TestWithOutliers:
         radio = Radio(range_stddev_m=0.1, obstructed_share=0.3, obstructed_mean_m=3.0)
         survey = make_survey(radio=radio)
         estimate = survey.scale("first_camera", "ABCDE")
-        status = estimate.observations.status
+        status = estimate.ranges.observations.status
         too_long = survey.log.range_m - survey.distance_m
         assert np.all(status[too_long > 2.0] == RangeStatus.OUTLIER)
         assert np.mean(status[np.abs(too_long) < 0.1] == RangeStatus.USED) > 0.99
         # By Geman-McClure's loss, far outliers pull by the inverse cube of their size; by Cauchy's, by the inverse.
-        weights = estimate.errors.robust_weights(too_long)
+        weights = estimate.ranges.errors.robust_weights(too_long)
         assert weights[np.abs(too_long) < 0.1].min() > 0.7
         assert weights[too_long > 2.0].max() < 0.005
 
@@ -221,8 +221,8 @@ class TestRefused:
     def test_the_papers_method_where_its_steadier_branch_is_negative(self, make_survey: MakeSurvey) -> None:
         survey = make_survey()
         robust = survey.scale("first_camera", "ABCDE")
-        assert robust.two_candidate is not None
-        assert robust.two_candidate.scale < 0
+        assert robust.ranges.two_candidate is not None
+        assert robust.ranges.two_candidate.scale < 0
         with pytest.raises(GeometryError, match="two-candidate found no positive scale"):
             survey.scale("first_camera", "ABCDE", options=ScaleOptions(method="two-candidate"))
 
@@ -277,7 +277,7 @@ class TestOpenButNotFatal:
             centers_m=on_a_loop_at_one_height(make_survey), anchors_m=ONE_ANCHOR_M, radio=NOISE, num_epochs=3
         )
         estimate = survey.scale("unknown")
-        (anchor,) = estimate.anchors
+        (anchor,) = estimate.ranges.anchors
         assert anchor.mirror_position_m is not None
         assert any("flat" in reason for reason in estimate.reasons)
         truth = survey.frame_from_site("first_camera").apply(survey.anchors_m["A"])
@@ -299,7 +299,7 @@ class TestOpenButNotFatal:
         estimate = survey.scale("first_camera", "ABCD", thinned)
         assert any("anchor E" in reason for reason in estimate.reasons)
         assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
-        assert set(estimate.observations.status[np.array(ids) == "E"]) == {RangeStatus.UNKNOWN_ANCHOR}
+        assert set(estimate.ranges.observations.status[np.array(ids) == "E"]) == {RangeStatus.UNKNOWN_ANCHOR}
 
 
 class TestBias:
@@ -307,14 +307,14 @@ class TestBias:
         biases = dict.fromkeys("ABCDE", 0.15)
         survey = make_survey(radio=Radio(range_stddev_m=0.02, range_bias_m=biases), num_epochs=3)
         estimate = survey.scale("first_camera", "ABCDE")
-        assert [anchor.range_bias_m for anchor in estimate.anchors] == pytest.approx([0.15] * 5, abs=0.03)
+        assert [anchor.range_bias_m for anchor in estimate.ranges.anchors] == pytest.approx([0.15] * 5, abs=0.03)
         assert survey.relative_error(estimate) == pytest.approx(0.0, abs=0.005)
 
     def test_with_a_prior_of_zero_it_is_held_at_zero(self, make_survey: MakeSurvey) -> None:
         survey = make_survey(radio=NOISE)
         held = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
         estimate = survey.scale("first_camera", "ABCDE", range_model=held)
-        assert [anchor.range_bias_m for anchor in estimate.anchors] == [0.0] * 5
+        assert [anchor.range_bias_m for anchor in estimate.ranges.anchors] == [0.0] * 5
 
 
 def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None:
@@ -329,8 +329,8 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
         for observations in (held_out, spoilt)
     )
     assert first.value == second.value
-    assert np.all(second.observations.status[is_check] == RangeStatus.CHECK)
-    assert np.all(np.isnan(second.errors.stddev_m[is_check]))
+    assert np.all(second.ranges.observations.status[is_check] == RangeStatus.CHECK)
+    assert np.all(np.isnan(second.ranges.errors.stddev_m[is_check]))
 
 
 def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
@@ -360,8 +360,8 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
     # The judged problem holds the scale no better than the lengths do in a map that bends.
     lengths, posed = (
-        known(find_kind(held.kinds, LengthScale)),
-        known(find_kind(held.kinds, RangeScale)).solved.problem.distances,
+        known(find_kind(held.on_map.kinds, LengthScale)),
+        known(find_kind(held.on_map.kinds, RangeScale)).solved.problem.distances,
     )
     assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
 
@@ -373,7 +373,7 @@ def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wr
     mistyped = replace(distances, distance_m=distances.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
     found = survey.scale("unknown", distances=mistyped)
     low, high = found.interval_95
-    np.testing.assert_array_equal(known(find_kind(found.kinds, LengthScale)).is_kept, np.arange(2) != wrong)
+    np.testing.assert_array_equal(known(find_kind(found.on_map.kinds, LengthScale)).is_kept, np.arange(2) != wrong)
     assert low < survey.truth("first_camera").scale < high
     assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
 
@@ -393,7 +393,7 @@ def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(m
 
     def spread_m(estimate: ScaleEstimate) -> float:
         """Return the largest error of the distances between anchors."""
-        found = np.array([anchor.position_m for anchor in estimate.anchors])
+        found = np.array([anchor.position_m for anchor in estimate.ranges.anchors])
         return float(np.abs(pdist(found) - pdist(truth)).max())
 
     alone, held = survey.scale("unknown", log=log), survey.scale("unknown", log=log, distances=between_anchors(survey))
@@ -416,7 +416,7 @@ def test_ranges_between_anchors_of_the_log_do_so_too(make_survey: MakeSurvey) ->
     ).with_anchors(set(ids))
     alone, held = survey.scale("unknown", log=log), survey.scale("unknown", log=with_peers)
     off_m = [
-        np.abs(pdist(np.array([anchor.position_m for anchor in estimate.anchors])) - lengths).max()
+        np.abs(pdist(np.array([anchor.position_m for anchor in estimate.ranges.anchors])) - lengths).max()
         for estimate in (alone, held)
     ]
     assert off_m[1] < 0.75 * off_m[0]
@@ -425,7 +425,7 @@ def test_ranges_between_anchors_of_the_log_do_so_too(make_survey: MakeSurvey) ->
 def test_the_noise_is_found_from_the_ranges_themselves(make_survey: MakeSurvey) -> None:
     radio = Radio(range_stddev_m=0.07, obstructed_share=0.1, obstructed_mean_m=3.0)
     estimate = make_survey(radio=radio, num_epochs=4).scale("first_camera", "ABCDE")
-    assert estimate.noise_stddev_m == pytest.approx(0.07, rel=0.2)
+    assert estimate.ranges.noise_stddev_m == pytest.approx(0.07, rel=0.2)
 
 
 def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
@@ -438,7 +438,7 @@ def test_noise_that_the_log_states_is_believed(make_survey: MakeSurvey) -> None:
         range_stddev_m=np.full(len(log), 0.3),
     )
     far = log.range_m > 5.0
-    stddev = survey.scale("first_camera", "ABCDE", stated).errors.stddev_m
+    stddev = survey.scale("first_camera", "ABCDE", stated).ranges.errors.stddev_m
     np.testing.assert_allclose(stddev[far], 0.3, rtol=0.01)
 
 

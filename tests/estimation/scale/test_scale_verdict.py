@@ -69,7 +69,7 @@ def test_few_ranges_and_many_outliers_have_their_advice(make_survey: MakeSurvey)
     obstructed = Radio(range_stddev_m=0.05, obstructed_share=0.45, obstructed_mean_m=5.0)
     many = make_survey(radio=obstructed, num_epochs=4).scale("first_camera", "ABCDE")
     assert any("nothing stands between" in advice for advice in many.advice)
-    status = many.observations.status
+    status = many.ranges.observations.status
     outliers = np.mean(status[status <= RangeStatus.OUTLIER] == RangeStatus.OUTLIER)
     assert any(reason.startswith(f"{100 * outliers:.0f} % of the ranges do not fit") for reason in many.reasons)
 

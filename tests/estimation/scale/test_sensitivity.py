@@ -25,10 +25,10 @@ def test_biases_and_a_slope_change_the_scale_as_said(make_survey: MakeSurvey, fr
     of_a = survey.log.anchor_index == 0
     true = survey.distance_m
     cases = {
-        base.sensitivity.common_bias_per_cm: np.full(len(true), 0.01),
-        base.sensitivity.anchor_bias_per_cm["A"]: 0.01 * of_a,
+        base.ranges.sensitivity.common_bias_per_cm: np.full(len(true), 0.01),
+        base.ranges.sensitivity.anchor_bias_per_cm["A"]: 0.01 * of_a,
         # A tenth of a percent, because the robust loss is not linear for more.
-        base.sensitivity.range_slope_per_percent / 10: 0.001 * true,
+        base.ranges.sensitivity.range_slope_per_percent / 10: 0.001 * true,
     }
     for expected, error in cases.items():
         changed = survey.scale(frame, "ABCD", survey.log_with(true + error), range_model=HELD)
@@ -46,13 +46,15 @@ def test_a_lever_arm_that_is_wrong_changes_the_scale_as_said(make_survey: MakeSu
         wrong = initialize_scale(
             observations, survey.trajectory, anchors, anchor_frame="first_camera", range_model=HELD
         )
-        expected = base.sensitivity.lever_arm_per_cm[axis]
+        expected = base.ranges.sensitivity.lever_arm_per_cm[axis]
         assert 100 * (wrong.value / base.value - 1) == pytest.approx(expected, abs=0.01 + 0.05 * abs(expected))
 
 
 def test_ranges_one_percent_longer_make_a_map_of_unknown_anchors_one_percent_larger(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=FAR_ANCHORS_M, num_epochs=2, tag_in_cam_m=(0.0, 0.0, 0.0))
-    assert survey.scale("unknown", range_model=HELD).sensitivity.range_slope_per_percent == pytest.approx(1.0, abs=0.02)
+    assert survey.scale("unknown", range_model=HELD).ranges.sensitivity.range_slope_per_percent == pytest.approx(
+        1.0, abs=0.02
+    )
 
 
 def test_of_ranges_as_long_as_most_none_is_short(make_survey: MakeSurvey) -> None:
@@ -63,7 +65,7 @@ def test_of_ranges_as_long_as_most_none_is_short(make_survey: MakeSurvey) -> Non
     in_many_worlds = [
         make_survey(centers_m=circle, anchors_m=anchors_m, tag_in_cam_m=(0, 0, 0), seed=seed)
         .scale("first_camera", "AB", range_model=HELD)
-        .sensitivity.short_range_per_cm
+        .ranges.sensitivity.short_range_per_cm
         for seed in range(3)
     ]
     np.testing.assert_allclose(in_many_worlds, in_many_worlds[0], rtol=1e-6)

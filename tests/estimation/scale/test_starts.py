@@ -92,7 +92,7 @@ def test_a_path_that_is_nearly_flat_tells_the_sides_of_its_anchors(make_survey: 
 def test_an_anchor_that_is_found_in_one_place_from_both_sides_has_no_other(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=Radio(range_stddev_m=0.05))
     estimate = survey.scale("site", "ABC")
-    assert [anchor.mirror_position_m for anchor in estimate.anchors] == [None] * 5
+    assert [anchor.mirror_position_m for anchor in estimate.ranges.anchors] == [None] * 5
 
 
 def test_unknown_anchors_are_found_from_a_path_that_has_its_place_whatever_was_thought_of_them(

@@ -159,7 +159,7 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
     Raises:
         GeometryError: the scale is not positive, or, if it is checked, outside the interval of the robust estimate.
     """
-    table, (low, high) = robust.two_candidate, robust.interval_95
+    table, (low, high) = robust.ranges.two_candidate, robust.interval_95
     if table is None or not table.scale > 0:
         raise GeometryError("two-candidate found no positive scale: use the robust method")
     if is_checked and not low <= table.scale <= high:

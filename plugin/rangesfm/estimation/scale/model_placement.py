@@ -211,7 +211,7 @@ class Piece:
     @property
     def is_placed(self) -> bool:
         """Whether it has its place in the site by more than ranges."""
-        by_others = any(each.is_used and each.places_map and not each.is_solved for each in self.estimate.kinds)
+        by_others = any(each.is_used and each.places_map and not each.is_solved for each in self.estimate.on_map.kinds)
         return self.in_site and (by_others or self.estimate.frame == "first_camera")
 
     @property
@@ -223,7 +223,7 @@ class Piece:
     def anchors(self) -> dict[str, AnchorEstimate]:
         """Estimates of the anchors in common that have a place, by id."""
         moved = replace(self.metric_from_sfm @ self.estimate.metric_from_sfm.inverse(), scale=1.0)
-        own = (each for each in self.estimate.anchors if each.anchor_id not in self.elsewhere_m)
+        own = (each for each in self.estimate.ranges.anchors if each.anchor_id not in self.elsewhere_m)
         return {each.anchor_id: each.moved(moved) for each in own if np.isfinite(each.position_m).all()}
 
     def problem(self, anchors: Sequence[AnchorEstimate], *, frame_is_free: bool) -> RangeProblem:
@@ -235,11 +235,11 @@ class Piece:
         Args:
             anchors: of the log, with the priors that are common to all pieces.
         """
-        observations, log = self.estimate.observations, self.estimate.observations.log
+        observations, log = self.estimate.ranges.observations, self.estimate.ranges.observations.log
         is_in_common = np.array([each not in self.elsewhere_m for each in log.anchor_ids], dtype=bool)[log.anchor_index]
-        is_used = observations.has_place & np.isfinite(self.estimate.errors.stddev_m) & is_in_common
+        is_used = observations.has_place & np.isfinite(self.estimate.ranges.errors.stddev_m) & is_in_common
         rows, no_place = np.flatnonzero(is_used), np.full(3, np.nan)
-        errors = self.estimate.errors.subset(rows)
+        errors = self.estimate.ranges.errors.subset(rows)
         return RangeProblem(
             centers=observations.centers[rows],
             tag_from_center=observations.tag_from_center[rows],
@@ -359,7 +359,7 @@ def _fit(pieces: Sequence[Piece], anchors_m: Mapping[str, Array], num_per_anchor
         anchors_m: where anchors begin, by id; anchors without a place are left out.
         num_per_anchor: number of ranges of each piece to each anchor that are used; None: all.
     """
-    anchors, loss, in_site = _common_anchors(pieces), pieces[0].estimate.errors.loss, pieces[0].in_site
+    anchors, loss, in_site = _common_anchors(pieces), pieces[0].estimate.ranges.errors.loss, pieces[0].in_site
     start_m = np.array([anchors_m.get(each.anchor_id, np.full(3, np.nan)) for each in anchors]).reshape(-1, 3)
     has_place, parts = np.isfinite(start_m).all(axis=1), list[RangeProblem]()
     for k, piece in enumerate(pieces):
@@ -376,7 +376,7 @@ def _fit(pieces: Sequence[Piece], anchors_m: Mapping[str, Array], num_per_anchor
 def _common_anchors(pieces: Sequence[Piece]) -> list[AnchorEstimate]:
     """Return the anchors with their priors, each from a piece that has ranges to it if there is one."""
     anchors = []
-    for estimates in zip(*(piece.estimate.anchors for piece in pieces), strict=True):
+    for estimates in zip(*(piece.estimate.ranges.anchors for piece in pieces), strict=True):
         heard = max(estimates, key=lambda anchor: anchor.prior_bias_stddev_m)
         given = [each for each, piece in zip(estimates, pieces, strict=True) if pieces[0].in_site and piece.in_site]
         known = [each for each in given if each.prior_position_m is not None]

@@ -11,14 +11,10 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.joint_map import JointMap, KindOnMap
+from rangesfm.measurements.joint_map import JointMap
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
-from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
-from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
-from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95, NOTHING_KNOWN
@@ -133,56 +129,6 @@ class ScaleEstimate:
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
-    @property
-    def observations(self) -> RangeObservations:
-        """All ranges of the log, with their status by final weight."""
-        return self.ranges.observations
-
-    @property
-    def errors(self) -> RangeErrors:
-        """Errors of all ranges of the log, as weighted."""
-        return self.ranges.errors
-
-    @property
-    def predicted_m(self) -> Array:
-        """(n,) ranges of the log as the scaled map predicts them, metres; NaN without a place."""
-        return self.ranges.predicted_m(self.metric_from_sfm)
-
-    @property
-    def weights(self) -> Array:
-        """(n,) robust weights in [0, 1] of the ranges about these; NaN without a place."""
-        return self.errors.robust_weights(self.predicted_m - self.observations.log.range_m)
-
-    @property
-    def noise_stddev_m(self) -> float:
-        """Standard deviation of an ordinary range."""
-        return self.ranges.noise_stddev_m
-
-    @property
-    def anchors(self) -> tuple[AnchorEstimate, ...]:
-        """Estimates of the anchors in the order of the log."""
-        return self.ranges.anchors
-
-    @property
-    def per_anchor(self) -> Mapping[str, float]:
-        """Scale from each anchor alone, by id; anchors that do not determine one are missing."""
-        return self.ranges.per_anchor
-
-    @property
-    def sensitivity(self) -> ScaleSensitivity:
-        """Change of the scale per error of the range model."""
-        return self.ranges.sensitivity
-
-    @property
-    def two_candidate(self) -> TwoCandidate | None:
-        """The paper's table; None where too few ranges have candidates."""
-        return self.ranges.two_candidate
-
-    @property
-    def kinds(self) -> tuple[KindOnMap, ...]:
-        """The measurements from which it was computed."""
-        return self.on_map.kinds
-
     def where_bent(self, options: ScaleOptions) -> ScaleEstimate:
         """Return the estimate of a map that is not refined where measurements bend it, anchors on their likelier sides.
 
@@ -202,7 +148,7 @@ class ScaleEstimate:
                     ranges=bent.kind.of_log(found.ranges),
                 )
             for sides in each.sides(on_map):
-                found = found.with_anchors(sides.applied_to(found.anchors))
+                found = found.with_anchors(sides.applied_to(found.ranges.anchors))
         return found
 
     def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> ScaleEstimate:

@@ -44,7 +44,7 @@ def mown(seed: int) -> RangesOnMap:
     log = RangeLog.from_arrays(np.full(len(at_s), "A"), np.maximum(range_m, 0.1), timestamp_s=at_s)
     anchors = [Anchor("A", None)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="unknown")
-    return known(find_kind(found.kinds, RangeScale)).solved
+    return known(find_kind(found.on_map.kinds, RangeScale)).solved
 
 
 @pytest.mark.parametrize("seed", [3, 5])
@@ -85,7 +85,7 @@ def drifting(share: float, seed: int) -> tuple[ScaleEstimate, Array, Array]:
 def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:
     rigid, path, places = drifting(0.3, seed=0)
     placed = rigid.where_bent(ScaleOptions())
-    bent_by_m = known(find_kind(rigid.kinds, RangeScale)).bends_m(rigid.on_map)
+    bent_by_m = known(find_kind(rigid.on_map.kinds, RangeScale)).bends_m(rigid.on_map)
     best = align_points(path, places)
     off_m = rmse(best.apply(path) - places)
     assert off_m > 0.5
@@ -96,12 +96,12 @@ def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much
     assert abs(np.log(placed.value / best.scale)) < half_width
     assert placed.reasons[-1] == "the path drifts by 0.52 m (root mean square) from where the ranges have it"
     assert rmse(bent_by_m[:, None]) == pytest.approx(off_m, abs=0.02)
-    used = placed.observations.status == RangeStatus.USED
+    used = placed.ranges.observations.status == RangeStatus.USED
     assert used.mean() > 0.95
-    np.testing.assert_allclose(placed.errors.stddev_m, 0.05, rtol=0.2)
+    np.testing.assert_allclose(placed.ranges.errors.stddev_m, 0.05, rtol=0.2)
 
 
 def test_a_path_that_does_not_drift_stays_as_it_was() -> None:
     rigid, _, _ = drifting(0.0, seed=1)
-    assert [*known(find_kind(rigid.kinds, RangeScale)).bent(rigid.on_map)] == []
+    assert [*known(find_kind(rigid.on_map.kinds, RangeScale)).bent(rigid.on_map)] == []
     assert rigid.where_bent(ScaleOptions()).metric_from_sfm is rigid.metric_from_sfm
