@@ -54,10 +54,7 @@ class MapAtRest:
         equations: of photos and all measurements; None if the photos are too many, or if they were not asked for.
         refined_params: which parameters of each camera are adjusted, by its id.
         firm_ids: of the frames that the photos hold together, which are the map as a whole.
-        pixel_stddev: standard deviation of a reprojection error's coordinate before the solution, the unit of the
-            equations. pixel_stddev_at_rest: the same after it.
-        reprojection_rms_px: root mean square length of the reprojection errors.
-        run: of the solver.
+        run: of the solver; its ``pixel_stddev`` is the unit of the equations. pixel_stddev_at_rest: the same after it.
         bend_m, num_graph_steps: of the keyframe graph before.
     """
 
@@ -67,10 +64,8 @@ class MapAtRest:
     equations: NormalEquations | None
     refined_params: dict[int, list[int]]
     firm_ids: Indices
-    pixel_stddev: float
-    pixel_stddev_at_rest: float
-    reprojection_rms_px: float
     run: SolverRun
+    pixel_stddev_at_rest: float
     bend_m: float
     num_graph_steps: int
 
@@ -183,10 +178,8 @@ def _adjusted(
         equations=equations_of(adjustment, added) if with_equations and adjustment.has_covariance else None,
         refined_params=adjustment.refined_params,
         firm_ids=frames_of_largest_part(problem.metric),
-        pixel_stddev=adjustment.pixel_stddev,
-        pixel_stddev_at_rest=pixel_stddev_of(adjustment.adjuster, adjustment.num_reprojections),
-        reprojection_rms_px=adjustment.reprojection_rms_px,
         run=run,
+        pixel_stddev_at_rest=pixel_stddev_of(adjustment.adjuster, adjustment.num_reprojections),
         bend_m=start.bend_m,
         num_graph_steps=start.num_steps,
     )
@@ -204,7 +197,7 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors:
         return joint_covariance(
             rest.equations,
             anchors={name: block for (what, name), block in rest.blocks.items() if what == "anchor"},
-            residual_stddev=bending_factor * rest.pixel_stddev,
+            residual_stddev=bending_factor * rest.run.pixel_stddev,
             refined_params=rest.refined_params,
             firm_frame_ids=rest.firm_ids,
         )

@@ -103,7 +103,7 @@ def refine_with_ranges(
         )
         rest = refine(problem)
         covariance = joint_errors(rest, 1.0) if options.covariance else UNKNOWN_ERRORS
-    return metric, summarize(rest, covariance, 1.0)
+    return metric, summarize(rest, covariance)
 
 
 @dataclass(frozen=True)
@@ -147,23 +147,17 @@ class RefineSummary(SolverRun):
     Attributes:
         num_graph_steps: of the solver on the keyframe graph before.
         bend_m: root mean square bending of the map in the keyframe graph, beyond any similarity.
-        reprojection_rms_px: root mean square length of the final reprojection errors.
-        pixel_stddev: standard deviation of a feature's coordinate, from the residuals before.
         misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
         ranges: as the refined map has them.
         covariance: how poses, cameras and anchors err together; not known if not asked for, if the model is too large,
             or if ranges and photos leave something undetermined.
-        bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
     """
 
     num_graph_steps: int
     bend_m: float
-    reprojection_rms_px: float
-    pixel_stddev: float
     misfits: tuple[Doubt, ...]
     ranges: RangesInMap
     covariance: MapErrors
-    bending_factor: float
 
     def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> Self:
         """Return the summary with others of the anchors."""
@@ -175,22 +169,15 @@ class RefineSummary(SolverRun):
         return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
 
 
-def summarize(rest: MapAtRest, covariance: MapErrors, bending_factor: float) -> RefineSummary:
-    """Summarise a refinement.
-
-    Args:
-        rest: the map at rest. covariance, bending_factor: as in the summary.
-    """
+def summarize(rest: MapAtRest, covariance: MapErrors) -> RefineSummary:
+    """Summarise a refinement, given the map at rest and its covariance."""
     return RefineSummary(
         **vars(rest.run),
         num_graph_steps=rest.num_graph_steps,
         bend_m=rest.bend_m,
-        reprojection_rms_px=rest.reprojection_rms_px,
-        pixel_stddev=rest.pixel_stddev,
         misfits=ranges_of(rest.problem.measured).misfits(rest.state),
         ranges=refined_ranges(rest, rest.state, covariance),
         covariance=covariance,
-        bending_factor=bending_factor,
     )
 
 

@@ -198,7 +198,7 @@ def _closed_by_photos(
 
     def finder_in(rest: MapAtRest, errors: MapErrors) -> LoopFinder:
         closed = rest.problem.metric
-        return LoopFinder(closed, path.as_in(closed), errors, rest.pixel_stddev)
+        return LoopFinder(closed, path.as_in(closed), errors, rest.run.pixel_stddev)
 
     def close(before: LoopFinder, loops: Sequence[Loop], is_last: bool) -> tuple[LoopFinder, Sequence[str]] | None:
         problem = _problem(survey, path, before.model, is_refined=True)

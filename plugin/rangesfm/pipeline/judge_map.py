@@ -19,6 +19,7 @@ from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.mistakes import MistakeTests
 from rangesfm.measurements.ranges.errors.components import CLOCKS
 from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.result_records import disagreements, distance_rows
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 
@@ -48,13 +49,17 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     doubts += run.doubts
     # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
+    of_lengths = tuple(disagreements(distance_rows(metric), metric.estimate.uncertainty.empirical))
     journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *metric.rivals.doubts)
+    journal.warn(*(doubt.reason for doubt in of_lengths))
     doubts += known_doubts
     of_map = [doubt.reason for doubt in doubts]
     against = (*(doubt.reason for doubt in of_lens), *diagnosis.of_place, *metric.rivals.doubts, *of_map)
     place = place_of_map(metric.estimate, metric.map_errors, path, against, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis)
-    return judged.doubted(*of_lens, *map(Doubt, diagnosis.reasons), *doubts, *map(Doubt, metric.rivals.doubts))
+    return judged.doubted(
+        *of_lens, *map(Doubt, diagnosis.reasons), *doubts, *map(Doubt, metric.rivals.doubts), *of_lengths
+    )
 
 
 def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:

@@ -80,6 +80,11 @@ class RefinedMap(RefineSummary):
     why_broken: tuple[str, ...] = ()
     loops: LoopClosure | None = None
 
+    @property
+    def bending_factor(self) -> float:
+        """Learnt bending over that which the photos' residuals let expect; 1 if unknown."""
+        return self.on_map.problem.bending_factor if self.on_map.is_at_rest else 1.0
+
 
 @dataclass(frozen=True)
 class MetricResult:

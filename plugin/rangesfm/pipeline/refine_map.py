@@ -90,12 +90,11 @@ def _problem(run: SurveyRun, metric: MetricResult, *, is_refined: bool) -> MapPr
 
 def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricResult:
     """Learn the errors at a map at rest, and return it as a result at its best estimate with its covariance."""
-    options, on_map, factor = run.survey.refine, metric.estimate.on_map, 1.0
+    options, on_map = run.survey.refine, metric.estimate.on_map
     if on_map.kinds:  # else nothing is known of the scale's error
         on_map = _measured_at_rest(run, metric, rest)
         if options.time_offset_stddev_s:
             on_map = on_map.without_clocks()
-        factor = on_map.problem.bending_factor
         on_map = on_map.concluded()
     covariance = UNKNOWN_ERRORS
     if options.covariance:
@@ -107,7 +106,7 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> MetricRe
             )
     model, path = rest.problem.metric, metric.trajectory
     model.update_point_3d_errors()
-    summary = summarize(rest, covariance, factor)
+    summary = summarize(rest, covariance)
     broken = why_broken(metric.scaled, model, path, metric.estimate, summary, options.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(

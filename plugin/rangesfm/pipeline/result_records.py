@@ -16,6 +16,8 @@ from rangesfm.arrays import Mask, median, rms
 from rangesfm.diagnostics.scale_bound import RISK, scale_bound
 from rangesfm.errors import number_text
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
@@ -52,9 +54,9 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
 
     Args:
         found: what the stages found.
-        others: entries that do not follow from it, from ``georeference`` on, and ``distances`` and ``comparison``.
+        others: entries that do not follow from it, from ``versions`` on, and ``comparison``.
     """
-    estimate, on_map = found.estimate, found.all_measured
+    estimate, on_map, on_earth = found.estimate, found.all_measured, found.georeference
     of_kinds: dict[str, Any] = {kind.kind: entry for kind in on_map.kinds if (entry := kind.entry(on_map))}
     return ResultSummary(
         scale=entries.ScaleEntry.model_validate(estimate),
@@ -68,7 +70,9 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         check_ranges=_check_ranges(found),
         refine=_refinement(found),
         loops=_loops(found),
+        distances=tuple(distance_rows(found)),
         points=points_entry(found),
+        georeference=None if on_earth is None else entries.GeoreferenceEntry.model_validate(on_earth),
         tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests)),
         reliability=_reliability(found),
         models=tuple(_model(model, estimate.metric_from_sfm) for model in found.models),
@@ -246,20 +250,19 @@ def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
     ]
 
 
-def disagreements(rows: Iterable[entries.DistanceRow], relative_scale_stddev: float, bending: float) -> Iterator[str]:
-    """Yield a line for each length that differs from the map by more than tape, scale and bending explain.
+def disagreements(rows: Iterable[entries.DistanceRow], relative_scale_stddev: float) -> Iterator[Doubt]:
+    """Yield a doubt for each length that differs from the map by more than tape, scale and bending explain.
 
     For a control length the uncertainty of the scale is not counted, because it has taken part in the scale.
 
     Args:
         relative_scale_stddev: relative standard deviation of the scale.
-        bending: relative standard deviation by which the scale varies from place to place.
     """
     for row in rows:
         of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
-        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, bending * row.measured_m)
+        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, BENDING * row.measured_m)
         if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
-            yield (
+            yield Doubt(
                 f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
                 f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
                 f"{_DISAGREES * stddev_m:.3f} m)"

@@ -10,10 +10,8 @@ import numpy as np
 from rangesfm.comparison.with_reference import papers_table, reference_in_frame
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
-from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.pipeline.metric_result import MetricResult
-from rangesfm.pipeline.result_records import disagreements, distance_rows, summary_of, tables_of
+from rangesfm.pipeline.result_records import summary_of, tables_of
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.comparison_row import ComparisonRow
@@ -39,10 +37,6 @@ def write_results(run: SurveyRun, metric: MetricResult) -> ResultFolder:
     survey, journal = run.survey, run.journal
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
-    distances = distance_rows(metric)
-    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
-    journal.warn(*disagreeing)
-    metric = metric.doubted(*map(Doubt, disagreeing))
     folder = survey.output.path
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
@@ -50,9 +44,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> ResultFolder:
             not_exported = _write_models_and_tables(survey, metric, staged)
         summary = summary_of(
             metric,
-            distances=distances,
             **({"comparison": comparison} if comparison else {}),
-            georeference=metric.georeference,
             versions=recorded_versions(),
             settings=recorded_settings(survey),
             inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],

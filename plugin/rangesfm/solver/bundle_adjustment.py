@@ -62,6 +62,8 @@ class SolverRun:
         is_still: whether the keyframes came to rest in free steps.
         is_stuck: whether free steps still promise a decrease that matters, but none of them succeeds.
         message: of the solver.
+        pixel_stddev: as of the bundle adjustment.
+        reprojection_rms_px: root mean square length of the reprojection errors at the end.
     """
 
     num_iterations: int
@@ -72,6 +74,8 @@ class SolverRun:
     is_still: bool
     is_stuck: bool
     message: str
+    pixel_stddev: float
+    reprojection_rms_px: float
 
     def then(self, later: SolverRun) -> SolverRun:
         """Return this run and a later one as one."""
@@ -219,6 +223,8 @@ def solve_bundle_adjustment(problem: BundleAdjustment, tolerance_m: float) -> So
         is_still=monitor.is_still,
         is_stuck=monitor.is_stuck,
         message=_message(monitor, tolerance_m, summary),
+        pixel_stddev=problem.pixel_stddev,
+        reprojection_rms_px=problem.reprojection_rms_px,
     )
 
 
