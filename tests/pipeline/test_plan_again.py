@@ -69,6 +69,23 @@ def test_a_doubtful_survey_is_told_what_its_plan_would_change(
     assert f"next time: {best[0]}" in printed
 
 
+def test_a_survey_is_told_it_too_where_only_a_check_length_contradicts_the_map(
+    walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    first, last = walked_survey.image_names[0], walked_survey.image_names[20]
+    wrong_m = 1.2 * np.linalg.norm(walked_survey.centers_m[0] - walked_survey.centers_m[20])
+    tape = tmp_path / "distances.csv"
+    tape.write_text(f"from,to,distance_m,stddev_m,kind\n{first},{last},{wrong_m:.3f},0.01,check\n")
+    flags = (*walked_survey.flags, "--anchors", "anchors.csv", "--anchor_frame", "site", "--no_report")
+    for out, more in (("without", ()), ("with", ("--distances", tape))):
+        rangesfm_command("scale", *flags, *more, "--output_path", tmp_path / out, cwd=walked_survey.folder)
+    before, scale = (json.loads((tmp_path / out / "result.json").read_text())["scale"] for out in ("without", "with"))
+    assert (before["verdict"], before["advice"]) == ("good", [])
+    assert scale["verdict"] == "doubtful"
+    assert scale["reasons"][0].startswith(f"check distance from {first} to {last}: ")
+    assert any("the scale would be" in advice for advice in scale["advice"])
+
+
 def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None:
     """Nobody can say what is behind or above path, anchors and the surfaces that the photos show."""
     times = np.linspace(0.0, 40.0, 41)

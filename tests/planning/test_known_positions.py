@@ -66,7 +66,7 @@ def test_three_control_points_bring_the_place_of_a_survey_with_ranges_to_centime
     together_m = plan.place.worst_keyframe_stddev_m
     assert together_m < 0.8 * alone["ranges"].worst_keyframe_m
     assert together_m < alone["positions"].worst_keyframe_m
-    assert plan.scale_stddev < min(each.uncertainty.empirical for each in alone.values())
+    assert plan.expected.uncertainty.empirical < min(each.uncertainty.empirical for each in alone.values())
     assert sum("alone (95 %)" in line for line in plan.lines) == 2
 
 

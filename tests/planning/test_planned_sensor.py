@@ -47,14 +47,16 @@ def test_a_level_camera_leaves_scale_factors_open_and_tilting_it_gains_what_the_
     (tmp_path / "plan.toml").write_text(LEVEL + "[imu]\n")
     survey = read_plan(tmp_path / "plan.toml")
     plan = plan_survey(survey)
-    assert plan.frame == "first_camera"
+    assert plan.expected.frame == "first_camera"
     assert plan.place is None
     assert plan.verdict == "doubtful"
-    assert max(plan.components, key=plan.components.__getitem__) == "accel_scale"
-    assert plan.up_stddev_deg is not None
+    assert (
+        max(plan.expected.uncertainty.components, key=plan.expected.uncertainty.components.__getitem__) == "accel_scale"
+    )
+    assert plan.expected.up_stddev_deg is not None
     assert any(line.startswith("vertical: ") for line in plan.lines)
     tilted = next(advice for advice in plan.advice_for_scale if advice.kind == "tilted camera")
-    assert tilted.scale_stddev < 0.6 * plan.scale_stddev
+    assert tilted.scale_stddev < 0.6 * plan.expected.uncertainty.empirical
     assert expect(tilted.planned).uncertainty.empirical == pytest.approx(tilted.scale_stddev, rel=0.15)
     better = expect(replace(tilted.planned, sensor=PlannedSensor(grade="tactical")))
     assert better.uncertainty.empirical < expect(tilted.planned).uncertainty.empirical
@@ -65,10 +67,10 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     before = plan_survey(survey)
     advised = next(advice for advice in before.advice_for_scale if advice.kind == "inertial sensor")
     plan = plan_survey(replace(survey, sensor=PlannedSensor()))
-    assert plan.scale_stddev == pytest.approx(advised.scale_stddev, rel=0.15)
+    assert plan.expected.uncertainty.empirical == pytest.approx(advised.scale_stddev, rel=0.15)
     assert {*plan.by_kind} == {"ranges", "imu"}
-    assert plan.by_kind["ranges"].uncertainty.empirical == pytest.approx(before.scale_stddev)
-    assert plan.scale_stddev < min(alone.uncertainty.empirical for alone in plan.by_kind.values())
+    assert plan.by_kind["ranges"].uncertainty.empirical == pytest.approx(before.expected.uncertainty.empirical)
+    assert plan.expected.uncertainty.empirical < min(alone.uncertainty.empirical for alone in plan.by_kind.values())
     assert np.isnan(plan.by_kind["imu"].worst_keyframe_m)
     assert plan.place is not None
     assert before.place is not None
@@ -77,7 +79,7 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     # Phones differ, so that one whose noise is known to be that of most brings more.
     gyro, accel = NOISE
     known = replace(survey, sensor=PlannedSensor(gyro_noise=gyro.median, accel_noise=accel.median))
-    assert expect(known).uncertainty.empirical < plan.scale_stddev
+    assert expect(known).uncertainty.empirical < plan.expected.uncertainty.empirical
 
 
 def test_a_sensor_with_few_photos_is_refused_alone_and_left_out_beside_a_radio() -> None:

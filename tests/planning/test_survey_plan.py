@@ -23,8 +23,12 @@ def plan() -> SurveyPlan:
 
 
 def test_the_budget_adds_up_to_the_stddev_and_the_interval_is_1_96_of_it(plan: SurveyPlan) -> None:
-    assert np.linalg.norm(list(plan.components.values())) == pytest.approx(plan.scale_stddev)
-    assert np.log1p(plan.scale_interval_95) == pytest.approx([-1.96 * plan.scale_stddev, 1.96 * plan.scale_stddev])
+    assert np.linalg.norm(list(plan.expected.uncertainty.components.values())) == pytest.approx(
+        plan.expected.uncertainty.empirical
+    )
+    assert np.log1p(plan.scale_interval_95) == pytest.approx(
+        [-1.96 * plan.expected.uncertainty.empirical, 1.96 * plan.expected.uncertainty.empirical]
+    )
 
 
 def test_advice_that_is_followed_gains_what_it_promised(plan: SurveyPlan) -> None:
@@ -110,14 +114,14 @@ def test_ten_times_the_ranges_average_out_their_noise_and_hardly_anything_else()
 
 def test_plan_json_holds_it_all_and_what_is_open_is_null(level_plan: SurveyPlan, tmp_path: Path) -> None:
     content = json.loads(write_plan(level_plan, tmp_path / "plan")[0].read_text())
-    assert content["scale_stddev"] == level_plan.scale_stddev
+    assert content["scale_stddev"] == level_plan.expected.uncertainty.empirical
     assert content["place"]["stddev_m"][2] is None
     assert len(content["advice_for_place"]) == len(level_plan.advice_for_place)
 
 
 def test_a_survey_with_unknown_anchors_has_no_place() -> None:
     plan = plan_survey(planned(FIVE_ANCHORS_M[:2], "unknown"))
-    assert plan.frame == "first_camera"
+    assert plan.expected.frame == "first_camera"
     assert plan.place is None
     assert {advice.kind for advice in plan.advice_for_place} == {"control points"}
 

@@ -29,12 +29,12 @@ def test_every_keyframe_has_the_colour_of_its_accuracy(plan: SurveyPlan) -> None
         # Legend entries read "below 0.1 m", "0.1 m to 0.12 m" or "above 0.2 m".
         ends = [float(end) for end in re.findall(r"[\d.]+", one.name)]
         low, high = {"b": [0.0, *ends], "a": [*ends, np.inf]}.get(one.name[0], ends)
-        for stddev_m, at in zip(plan.keyframe_stddevs_m, one.points, strict=True):
+        for stddev_m, at in zip(plan.expected.keyframe_stddevs_m, one.points, strict=True):
             assert np.isfinite(at).all() or not low < 1.96 * stddev_m < high
     assert len({one.color for one in series}) == len(series)
     ends_m = [float(one.name.split()[-2]) for one in series[:-1]]
     assert ends_m[3] == pytest.approx(10 * ends_m[0])  # a factor of 10 around the median
-    assert ends_m[1] <= 1.96 * np.median(plan.keyframe_stddevs_m) <= ends_m[2]
+    assert ends_m[1] <= 1.96 * np.median(plan.expected.keyframe_stddevs_m) <= ends_m[2]
 
 
 def test_walls_are_drawn_from_above(plan: SurveyPlan) -> None:

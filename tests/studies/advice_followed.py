@@ -62,7 +62,7 @@ def main() -> None:
         for what, advice in first_of(plan):
             after = runs_of(asked, f"{name}: {advice.words}", advice.planned, num_whole=0)
             if what == "scale":
-                promised, was = advice.scale_stddev, plan.scale_stddev
+                promised, was = advice.scale_stddev, plan.expected.uncertainty.empirical
             else:
                 promised, was = advice.place_stddev_m, plan.expected.worst_keyframe_m
             (found, chance), (found_before, chance_before) = spread(after, what), spread(before, what)

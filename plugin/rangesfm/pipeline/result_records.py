@@ -171,6 +171,7 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
         "why_not_kept": refined.why_broken,
         "iterations": refined.num_iterations,
         "keyframe_graph_steps": refined.num_graph_steps,
+        "bending_factor": refined.bending_factor,
         "correlation_inflation": ranges.errors.inflation,
         "scale_value": refined.scale,
         "relative_scale_stddev": refined.covariance.scale_stddev,

@@ -27,7 +27,6 @@ from rangesfm.solver.bending import Bending, MapBending, WalkBending
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import Observations, ScaleUncertainty, joined
-from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -121,9 +120,10 @@ class Expected:
         return judge(self.kinds[0].doubts(self.uncertainty), (), self.uncertainty, ScaleOptions())
 
     @property
-    def gravity(self) -> Gravity | None:
-        """The upward direction in the first camera, as far as it is measured."""
-        return upward_by(self.kinds, None)
+    def up_stddev_deg(self) -> float | None:
+        """Standard deviation of the vertical; None where it is not measured."""
+        gravity = upward_by(self.kinds, None)
+        return None if gravity is None else float(np.rad2deg(gravity.stddev_rad))
 
     @property
     def map_stddevs(self) -> Array | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.diagnostics.place import place_in_words
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.vision_information import VisionInformation
@@ -55,44 +56,39 @@ class SurveyPlan:
     """Expected result of a planned survey, as a run will state it.
 
     Attributes:
-        num_ranges: number of ranges that the radio will measure.
-        duration_s: duration of the survey.
-        anchors_m: position of each anchor in the site, by id.
-        frame: frame of the result, "site" or "first_camera".
-        scale_stddev: relative standard deviation of the scale.
-        scale_stddev_formal: the same if the errors of all ranges were independent.
-        scale_interval_95: relative ends of the scale's 95 % interval.
-        components: relative standard deviation of the scale from each component of the range errors, by name.
+        expected: what the run will state of its map.
         place: placement in the site; None if the frame is the first camera's.
-        keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
         verdict, reasons: the run's verdict on the scale; "refused" if it will refuse the scale.
-        up_stddev_deg: standard deviation of the vertical by the inertial sensor; None without one.
-        by_kind: the same by each kind of measurement alone, by its name; empty where the plan has one kind.
-        warnings: what is odd about the plan, and what a run will leave out.
+        by_kind: what is expected by each kind of measurement alone, by its name; empty where the plan has one kind.
         mistakes: for each possible mistake the smallest size that would be found (inf: no size that can happen), and
             the largest effect of a mistake that is not found, the largest on the scale first (inf: without limit).
         advice: changes that would gain something.
-        expected: the estimate from which all this is computed.
     """
 
-    num_ranges: int
-    duration_s: float
-    anchors_m: dict[str, tuple[float, ...]]
-    frame: str
-    scale_stddev: float
-    scale_stddev_formal: float
-    scale_interval_95: tuple[float, float]
-    components: dict[str, float]
+    expected: Expected
     place: PlannedPlace | None
-    keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
-    up_stddev_deg: float | None
     by_kind: dict[str, Expected]
-    warnings: tuple[str, ...]
     mistakes: tuple[MistakeTest, ...]
     advice: tuple[Advice, ...]
-    expected: Expected = field(repr=False)
+
+    @property
+    def anchors_m(self) -> dict[str, Array]:
+        """Position (3,) of each anchor in the site, by id."""
+        planned = self.expected.planned
+        return dict(zip((anchor.anchor_id for anchor in planned.anchors), planned.anchors_m, strict=True))
+
+    @property
+    def scale_interval_95(self) -> tuple[float, float]:
+        """Relative ends of the scale's 95 % interval."""
+        low, high = self.expected.uncertainty.interval_95
+        return float(np.expm1(low)), float(np.expm1(high))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is odd about the plan, and what a run will leave out."""
+        return (*self.expected.planned.warnings, *(() if self.expected.on_map is None else self.expected.notes))
 
     @property
     def advice_for_scale(self) -> list[Advice]:
@@ -130,19 +126,32 @@ class SurveyPlan:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON, with null for numbers that are not finite, and the advice in both orders."""
-        alone = {
-            kind: {"scale_stddev": each.uncertainty.empirical, "worst_keyframe_stddev_m": each.worst_keyframe_m}
-            for kind, each in self.by_kind.items()
+        expected, names = self.expected, ("name", "subject", "unit", *SIZES)
+        planned, uncertainty = expected.planned, expected.uncertainty
+        content = {
+            "num_ranges": planned.num_ranges,
+            "duration_s": planned.duration_s,
+            "anchors_m": {name: at.tolist() for name, at in self.anchors_m.items()},
+            "frame": expected.frame,
+            "scale_stddev": uncertainty.empirical,
+            "scale_stddev_formal": uncertainty.formal,
+            "scale_interval_95": self.scale_interval_95,
+            "components": uncertainty.components,
+            "place": self.place,
+            "keyframe_stddevs_m": expected.keyframe_stddevs_m.tolist(),
+            "verdict": self.verdict,
+            "reasons": self.reasons,
+            "up_stddev_deg": expected.up_stddev_deg,
+            "by_kind": {
+                kind: {"scale_stddev": each.uncertainty.empirical, "worst_keyframe_stddev_m": each.worst_keyframe_m}
+                for kind, each in self.by_kind.items()
+            },
+            "warnings": self.warnings,
+            "mistakes": [{name: getattr(each, name) for name in names} for each in self.mistakes],
+            "advice_for_scale": self.advice_for_scale,
+            "advice_for_place": self.advice_for_place,
         }
-        content = {part.name: _finite(getattr(self, part.name)) for part in fields(self) if part.repr}
-        del content["advice"]
-        names = ("name", "subject", "unit", *SIZES)
-        return content | {
-            "by_kind": _finite(alone),
-            "mistakes": [{name: each[name] for name in names} for each in content["mistakes"]],
-            "advice_for_scale": _finite(self.advice_for_scale),
-            "advice_for_place": _finite(self.advice_for_place),
-        }
+        return {name: _finite(value) for name, value in content.items()}
 
 
 @with_one_blas_thread
@@ -153,26 +162,14 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """
     expected, alone = _expect(planned), planned.by_kind
     verdict, reasons = _verdict(expected)
-    half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
-        num_ranges=planned.num_ranges,
-        duration_s=planned.duration_s,
-        anchors_m={a.anchor_id: tuple(at.tolist()) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)},
-        frame=expected.frame,
-        scale_stddev=expected.uncertainty.empirical,
-        scale_stddev_formal=expected.uncertainty.formal,
-        scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
-        components=expected.uncertainty.components,
-        place=_place(expected),
-        keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
-        verdict=verdict,
-        reasons=reasons,
-        up_stddev_deg=None if expected.gravity is None else float(np.rad2deg(expected.gravity.stddev_rad)),
+        expected,
+        _place(expected),
+        verdict,
+        reasons,
         by_kind={kind: _expect(each, expected.vision) for kind, each in alone.items()} if len(alone) > 1 else {},
-        warnings=(*planned.warnings, *(() if expected.on_map is None else expected.notes)),
         mistakes=() if expected.on_map is None else mistakes(expected.on_map),
         advice=advise(expected),
-        expected=expected,
     )
 
 
@@ -224,17 +221,17 @@ def size_in_words(size: float, unit: str) -> str:
 
 def _known(plan: SurveyPlan) -> Iterator[str]:
     low, high = (100 * end for end in plan.scale_interval_95)
-    of_anchors = f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, " if plan.anchors_m else ""
-    yield f"{of_anchors}result in the {plan.frame.replace('_', ' ')}'s frame"
-    if plan.anchors_m:
-        planned = plan.expected.planned
-        places = (f"{name} {planned.site.place_text(np.array(place))}" for name, place in plan.anchors_m.items())
+    expected, planned = plan.expected, plan.expected.planned
+    of_anchors = f"{planned.num_ranges} ranges in {planned.duration_s:.0f} s, " if planned.anchors else ""
+    yield f"{of_anchors}result in the {expected.frame.replace('_', ' ')}'s frame"
+    if planned.anchors:
+        places = (f"{name} {planned.site.place_text(place)}" for name, place in plan.anchors_m.items())
         yield f"anchors at {'; '.join(places)}{planned.axes}"
     interval = f"{low:+.2g} to {high:+.2g} % (95 %)" if np.isfinite(high) else "open"
     yield f"scale: {plan.verdict}; {interval}"
     yield from (f"  {reason}" for reason in plan.reasons)
-    if plan.up_stddev_deg is not None:
-        yield f"vertical: {_half_width_95(plan.up_stddev_deg, 'deg')} (95 %), by the inertial sensor"
+    if expected.up_stddev_deg is not None:
+        yield f"vertical: {_half_width_95(expected.up_stddev_deg, 'deg')} (95 %), by the inertial sensor"
     if plan.place is None:
         yield "place: none, as neither surveyed anchors nor known positions say where the map is in the site"
         return
@@ -259,7 +256,7 @@ def _alone(plan: SurveyPlan) -> Iterator[str]:
 
 
 def _budget(plan: SurveyPlan) -> Iterator[str]:
-    largest = sorted(plan.components.items(), key=lambda item: -item[1])[:_NUM_COMPONENTS]
+    largest = sorted(plan.expected.uncertainty.components.items(), key=lambda item: -item[1])[:_NUM_COMPONENTS]
     words = component_words(name for name, _ in largest)
     parts = [f"{words[name]} {100 * NORMAL_95 * stddev:.2g} %" for name, stddev in largest]
     if parts:
@@ -281,7 +278,7 @@ def _advised(plan: SurveyPlan) -> Iterator[str]:
     for_scale = [f"{each.words}: +-{100 * NORMAL_95 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
     for_place = [f"{each.words}: {_half_width_95(each.place_stddev_m)}" for each in plan.advice_for_place]
     now_m = np.inf if plan.place is None else plan.place.worst_keyframe_stddev_m
-    scale, place = f"+-{_rough(100 * NORMAL_95 * plan.scale_stddev, '%')}", _half_width_95(now_m)
+    scale, place = f"+-{_rough(100 * NORMAL_95 * plan.expected.uncertainty.empirical, '%')}", _half_width_95(now_m)
     purposes = {
         f"the scale, now {scale}": for_scale,
         f"the place of the least certain keyframe, now {place}": for_place,

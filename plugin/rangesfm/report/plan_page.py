@@ -43,9 +43,10 @@ def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
 
 def render_plan(plan: SurveyPlan) -> str:
     """Return the HTML text of the page of a plan."""
-    anchors = "1 anchor" if len(plan.anchors_m) == 1 else f"{len(plan.anchors_m)} anchors"
-    title = f"{anchors}, {count(len(plan.keyframe_stddevs_m))} keyframes"
-    now = {"scale": percent(NORMAL_95 * plan.scale_stddev), "place": _keyframe_known_least(plan)}
+    num, expected = len(plan.expected.planned.anchors), plan.expected
+    anchors = "1 anchor" if num == 1 else f"{num} anchors"
+    title = f"{anchors}, {count(len(expected.keyframe_stddevs_m))} keyframes"
+    now = {"scale": percent(NORMAL_95 * expected.uncertainty.empirical), "place": _keyframe_known_least(plan)}
     of_place = f"What would gain most for the place of the least certain keyframe, now ± {now['place']}"
     advice = [
         _advice(f"What would gain most for the scale, now ± {now['scale']}", plan.advice_for_scale),
@@ -85,22 +86,22 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
                 f"tilt {_half_width_95(place.tilt_stddev_deg, '°')}",
             ),
         ]
-    worst = int(np.argmax(plan.keyframe_stddevs_m))
+    planned, worst = plan.expected.planned, int(np.argmax(plan.expected.keyframe_stddevs_m))
     return [
         *of_place,
         ("Least certain keyframe", _keyframe_known_least(plan), f"number {worst + 1} on the path"),
-        ("Ranges", count(plan.num_ranges if plan.anchors_m else 0), f"in {duration(plan.duration_s)}"),
+        ("Ranges", count(planned.num_ranges if planned.anchors else 0), f"in {duration(planned.duration_s)}"),
     ]
 
 
 def _keyframe_known_least(plan: SurveyPlan) -> str:
-    return _half_width_95(max(plan.keyframe_stddevs_m), "m")
+    return _half_width_95(float(plan.expected.keyframe_stddevs_m.max()), "m")
 
 
 def accuracy_views(plan: SurveyPlan) -> Figure:
     """Return plan and elevation of the path; path and surroundings are coloured by their expected stddev."""
     centers = plan.expected.planned.trajectory.centers
-    edges = _edges(NORMAL_95 * np.array(plan.keyframe_stddevs_m))
+    edges = _edges(NORMAL_95 * plan.expected.keyframe_stddevs_m)
     # A plan is drawn in the site frame, z up, even where the result will be in another frame.
     views = tuple(_view(plan, view, centers, edges) for view in views_of(centers, "site"))
     whose = "in the site" if plan.place is not None else "against the first camera"
@@ -124,7 +125,7 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     line = view.seen(centers)
     walls = [np.insert(wall, 2, centers[:, 2].mean(), axis=1) for wall in plan.expected.planned.walls_m]
     limits = equal_view(np.vstack([line, places, spots, *map(view.seen, walls)]))
-    of_keyframe = np.digitize(NORMAL_95 * np.array(plan.keyframe_stddevs_m), edges)
+    of_keyframe = np.digitize(NORMAL_95 * plan.expected.keyframe_stddevs_m, edges)
     names = _names(edges)
     shown = names if len(edges) in of_keyframe else names[:-1]
     series = []
@@ -198,8 +199,9 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:
 
 
 def _components(plan: SurveyPlan) -> ReportTable:
-    words = component_words(plan.components)
-    largest = sorted(plan.components.items(), key=lambda item: -item[1])
+    components = plan.expected.uncertainty.components
+    words = component_words(components)
+    largest = sorted(components.items(), key=lambda item: -item[1])
     rows = [[words[name], percent(NORMAL_95 * stddev)] for name, stddev in largest]
     return ReportTable("What makes the scale uncertain", ["", "± of the scale (95 %)"], rows, is_narrow=True)
 
@@ -219,7 +221,9 @@ def _by_kind(plan: SurveyPlan) -> ReportTable:
         for kind, alone in plan.by_kind.items()
     ]
     if rows:
-        rows.append(["all together", percent(NORMAL_95 * plan.scale_stddev), _keyframe_known_least(plan)])
+        rows.append(
+            ["all together", percent(NORMAL_95 * plan.expected.uncertainty.empirical), _keyframe_known_least(plan)]
+        )
     header = ["", "scale ± (95 %)", "least certain keyframe ± (95 %)"]
     return ReportTable("What each kind of measurement would give", header, rows, kind="worded")
 
