@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import laspy
 import numpy as np
@@ -28,6 +29,9 @@ from rangesfm.export.metric_map import colored_points, in_frame, moved, up_in_wo
 from rangesfm.options import ExportOptions
 from rangesfm.util.geometry.georeference import Georeference, georeference_at
 from rangesfm.util.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from tests.conftest import Command, WalkedSurvey
 
 Array = npt.NDArray[np.float64]
 
@@ -306,3 +310,15 @@ def test_photos_that_do_not_lean_to_either_side_of_a_flat_path_do_not_say_which_
     flight = replace(path, centers=path.centers * [1.0, 1.0, 0.0], world_from_cam=headings @ down)
     with pytest.raises(InputError, match=r"do not say which side of the path's plane is up.*--up X,Y,Z"):
         up_in_world(flight, "path")
+
+
+def test_a_run_levels_by_the_upward_direction_that_it_was_given_as_an_export_of_its_result_does(
+    walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
+) -> None:
+    """The given direction is not that of the photos, which were held level."""
+    flags = (*walked_survey.flags, "--anchor_frame", "unknown", "--up_in_first_camera", "0.5,-1,0", "--no_report")
+    level = ("--formats", "tum", "--export_frame", "level", "--output_path", tmp_path / "out")
+    rangesfm_command("scale", *flags, *level, cwd=walked_survey.folder)
+    rangesfm_command("export", "out", "--formats", "tum", "--frame", "level", "--output_path", "again", cwd=tmp_path)
+    of_run, of_export = (np.loadtxt(tmp_path / name / "trajectory.tum") for name in ("out", "again"))
+    np.testing.assert_allclose(of_run, of_export, atol=1e-6)

@@ -23,6 +23,7 @@ from rangesfm.sfm.loops.rounds import LoopClosure
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.util.geometry.georeference import Georeference
+from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -171,11 +172,10 @@ class MetricResult:
             zip(self.trajectory.image_names, self.map_errors.centers_m2(self.trajectory.frame_ids), strict=True)
         )
 
-    @property
-    def upward(self) -> Array | None:
-        """Return the upward unit vector (3,) in the final map as it was measured; None if it was not."""
+    def upward(self, given: Gravity | None) -> Array | None:
+        """Return the upward unit vector (3,) in the final map, as it was measured or else as given; None if unknown."""
         on_map = self.all_measured
-        if (gravity := upward_by(on_map.kinds, None)) is None:
+        if (gravity := upward_by(on_map.kinds, given)) is None:
             return None
         return np.asarray(on_map.estimate.rotation @ on_map.path.world_from_cam[0] @ gravity.up_in_first_camera)
 

@@ -23,6 +23,7 @@ from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
 
@@ -69,8 +70,12 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     return _levelled(planned, colored_points(model)[0], len(used), upward)
 
 
-def with_advice(metric: MetricResult) -> MetricResult:
-    """Add advice on what to change next time, where the scale or the place is doubtful."""
+def with_advice(metric: MetricResult, upward: Gravity | None) -> MetricResult:
+    """Add advice on what to change next time, where the scale or the place is doubtful.
+
+    Args:
+        upward: the upward direction in the first camera as given.
+    """
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
     if metric.estimate.method == "two-candidate":  # another survey would not make its scale more certain
         return metric
@@ -96,7 +101,7 @@ def with_advice(metric: MetricResult) -> MetricResult:
         noise = learnt.get("gyro_noise"), learnt.get("accel_noise")
         sensor = PlannedSensor(gyro_noise=noise[0], accel_noise=noise[1]) if all(noise) else None
         planned = _of_run(trajectory, anchors, frame, arm, stddevs, site, sensor)
-        expected = expect(_levelled(planned, points_m, int(used.sum()), metric.upward))
+        expected = expect(_levelled(planned, points_m, int(used.sum()), metric.upward(upward)))
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])

@@ -42,6 +42,7 @@ from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.files.output_folder import sole_writer
+from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
@@ -219,5 +220,5 @@ def _in_map(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyRun:
 def with_results(run: SurveyRun, made: MetricResult) -> ResultFolder:
     """Add advice for the next survey to a map, compare it with the reference, and write all results."""
     with run.journal.stage("advice"):
-        advised = with_advice(made)
+        advised = with_advice(made, gravity_of(run.survey.scale.up_in_first_camera))
     return write_results(run, advised)

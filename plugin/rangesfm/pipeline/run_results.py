@@ -24,6 +24,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_hashes
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import path_of
+from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.reference import write_reference
 
 
@@ -109,7 +110,7 @@ def _write_models_and_tables(survey: Survey, found: MetricResult, folder: Path) 
         images_path=survey.images.path,
         database_path=survey.output.path / DATABASE_NAME,
         is_site=found.estimate.frame == "site",
-        upward=found.upward,
+        upward=found.upward(gravity_of(survey.scale.up_in_first_camera)),
         georeference=found.georeference,
         center_covariance_m2=found.center_covariance_m2,
     )
