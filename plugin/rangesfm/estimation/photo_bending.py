@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Mask
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.vision_information import misplaced_points, model_rays
@@ -129,30 +129,8 @@ def bending_of_model(
         bundle = bundle_adjustment(model, camera, options, num_threads=num_threads, left_out_ids=misplaced.tolist())
         if bundle.has_covariance:
             equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
-            firm_ids = frames_of_largest_part(model)
-            return by_photos(equations, bundle.pixel_stddev, trajectory, firm_ids, is_at_optimum=True)
+            is_firm = np.isin(trajectory.frame_ids, frames_of_largest_part(model))
+            return PhotoBending(PhotosAlone(equations, bundle.pixel_stddev), trajectory, is_firm, is_at_optimum=True)
     except (SolverError, GeometryError, InputError):
         pass
     return WalkBending(trajectory)
-
-
-def by_photos(
-    equations: NormalEquations,
-    pixel_stddev: float,
-    trajectory: Trajectory,
-    firm_frame_ids: Indices,
-    *,
-    is_at_optimum: bool,
-) -> PhotoBending:
-    """Return the bending of a map from the photos' part of its normal equations.
-
-    Args:
-        pixel_stddev: standard deviation of a reprojection error's coordinate.
-        trajectory: of the map, in its world.
-        firm_frame_ids: of the frames whose centres are the map's size and place.
-
-    Raises:
-        GeometryError: the photos do not determine the map up to a similarity.
-    """
-    is_firm = np.isin(trajectory.frame_ids, firm_frame_ids)
-    return PhotoBending(PhotosAlone(equations, pixel_stddev), trajectory, is_firm, is_at_optimum)

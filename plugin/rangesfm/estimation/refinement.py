@@ -69,10 +69,6 @@ class MapAtRest:
     bend_m: float
     num_graph_steps: int
 
-    def is_estimated(self, block: Block) -> bool:
-        """Return whether a block was free."""
-        return block in self.state.blocks and not any(block in kind.fixed for kind in self.problem.kinds)
-
 
 def refine(problem: MapProblem, *, with_equations: bool = True) -> MapAtRest:
     """Refine a model in place, and return it at rest.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Mask
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import why_broken
@@ -15,7 +17,7 @@ from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.drift import bend
 from rangesfm.estimation.map_posterior import errors_at_estimate, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
-from rangesfm.estimation.photo_bending import by_photos
+from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import Loop
 from rangesfm.estimation.with_ranges import refined_ranges, summarize
@@ -24,6 +26,7 @@ from rangesfm.measurements.kind import MapState
 from rangesfm.pipeline.metric_result import MetricResult, RefinedMap
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.solver.bending import MapBending, WalkBending
+from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, measured_in_map
 from rangesfm.survey.survey_run import SurveyRun
@@ -162,12 +165,11 @@ def with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: 
     return replace(metric, estimate=estimate, refined=refined)
 
 
-def _bending_at_rest(rest: MapAtRest, path: Trajectory) -> MapBending:
+def _bending_at_rest(rest: MapAtRest, path: Trajectory, is_firm: Mask) -> MapBending:
     if rest.equations is not None:
-        try:
-            return by_photos(rest.equations, rest.pixel_stddev_at_rest, path, rest.firm_ids, is_at_optimum=False)
-        except GeometryError:
-            pass
+        with contextlib.suppress(GeometryError):  # the photos do not determine the map up to a similarity
+            photos = PhotosAlone(rest.equations, rest.pixel_stddev_at_rest)
+            return PhotoBending(photos, path, is_firm, is_at_optimum=False)
     return WalkBending(path)
 
 
@@ -177,7 +179,7 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> 
     path = metric.trajectory.as_in(model)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
-    bending = _bending_at_rest(rest, path)
+    bending = _bending_at_rest(rest, path, is_firm)
     of_model = MapOfPhotos(model, bending, run.survey, metric.observations, scale, before, rest)
     located, _ = kinds_in_map(metric.inputs, of_model)
     others = tested_kinds(
