@@ -447,9 +447,9 @@ def test_the_prior_of_a_bias_is_told_as_it_was_given(make_survey: MakeSurvey) ->
     survey = make_survey(radio=NOISE, num_epochs=4)
     log = survey.log_with(survey.log.range_m + 0.1 * np.sin(survey.log.timestamp_s / 5))
     estimate = survey.scale("first_camera", "ABCDE", log)
-    assert estimate.errors.inflation > 1.2
+    assert estimate.ranges.errors.inflation > 1.2
     given_m = RangeModelOptions().range_bias_stddev_m
-    np.testing.assert_allclose([each.prior_bias_stddev_m for each in estimate.anchors], given_m, rtol=1e-12)
+    np.testing.assert_allclose([each.prior_bias_stddev_m for each in estimate.ranges.anchors], given_m, rtol=1e-12)
 
 
 def no_ranges() -> RangeObservations:
