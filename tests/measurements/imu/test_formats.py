@@ -293,7 +293,10 @@ def test_values_at_the_end_of_the_scale_are_said(tmp_path: Path) -> None:
     rates[50:60, 1] = np.radians(250.0)
     log = ImuLog(LOG.timestamp_s, rates, LOG.accel_m_s2)
     path = table(tmp_path / "imu.csv", ",".join(CANONICAL_COLUMNS), log)
-    assert any("10 samples of the gyroscope are at the end of its scale" in doubt for doubt in read_imu(path).doubts)
+    assert any(
+        f"10 of {len(LOG)} samples of the gyroscope are at the end of its scale" in doubt
+        for doubt in read_imu(path).doubts
+    )
     assert not any("end of its scale" in doubt for doubt in read_imu(canonical(tmp_path)).doubts)
 
 

@@ -133,3 +133,26 @@ def test_a_log_of_another_day_is_refused() -> None:
     later = replace(problem.log, timestamp_s=problem.log.timestamp_s + 86400.0)
     with pytest.raises(GeometryError, match="no time in common"):
         scale_by_sensor(replace(problem, log=later))
+
+
+def test_a_stretch_at_the_end_of_an_accelerometers_scale_is_left_out() -> None:
+    """A fifth of the samples is clipped, at a value that no data sheet has."""
+    problem = posed(by_hand(5, axes=(3.0, 3.0, 3.0)), np.zeros(3))
+    log = problem.log
+    most = float(np.quantile(np.abs(log.accel_m_s2).max(axis=1), 0.8))
+    clipped = replace(log, accel_m_s2=np.clip(log.accel_m_s2, -most, most))
+    assert np.mean(clipped.clipped[:, 1]) == pytest.approx(0.2, abs=0.01)
+    assert not clipped.clipped[:, 0].any()
+    assert not log.clipped.any()
+    whole, found = (scale_by_sensor(replace(problem, log=each)) for each in (log, clipped))
+    assert len(found.intervals) < len(whole.intervals)
+    off = [float(np.log(each.alone.scale.value / METRES_PER_UNIT)) for each in (whole, found)]
+    assert abs(off[1]) < 0.01 + abs(off[0])
+    assert abs(off[1]) < 3 * found.alone.posterior.uncertainty.empirical
+
+
+def test_a_sensor_that_is_at_the_end_of_its_scale_between_all_photos_tells_nothing() -> None:
+    problem = posed(by_hand(5), np.zeros(3))
+    clipped = replace(problem.log, accel_m_s2=np.clip(problem.log.accel_m_s2, -1.0, 1.0))
+    with pytest.raises(GeometryError, match="at the end of its scale between all photos"):
+        scale_by_sensor(replace(problem, log=clipped))

@@ -18,7 +18,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
-from rangesfm.measurements.imu.log import ImuLog, times_of_sampling
+from rangesfm.measurements.imu.log import STANDARD_GRAVITY_M_S2, ImuLog, times_of_sampling
 from rangesfm.measurements.imu.signals import (
     ACCEL,
     GRAVITY,
@@ -41,7 +41,6 @@ CANONICAL_COLUMNS = (
     *(f"accel_{axis}_m_s2" for axis in "xyz"),
 )
 _EXPECTED = f"expected a table with {','.join(CANONICAL_COLUMNS)}, or the log of a phone"
-STANDARD_GRAVITY_M_S2 = 9.80665
 """Acceleration that is called 1 g (ISO 80000-3)."""
 # Median length of the acceleration of what is carried, with gravity: within a third of it.
 _WITH_GRAVITY = (0.67, 1.5)
@@ -50,11 +49,6 @@ _STEADY = 0.4
 _MIN_NUM = 100
 _SLOWEST_STEP_S = 0.2
 _FASTEST_RAD_S = np.radians(4000.0)  # no gyroscope in phones, cameras and drones measures faster turns
-# Full scales of accelerometers in g and of gyroscopes in deg/s, as data sheets of MEMS sensors give them; the factory's
-# scale factors differ by some percent.
-_FULL_SCALES_M_S2 = STANDARD_GRAVITY_M_S2 * np.array([2.0, 4.0, 8.0, 16.0])
-_FULL_SCALES_RAD_S = np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0])
-_FULL_SCALE_ERROR = 0.03
 _TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _VIDEOS = (".mp4", ".mov", ".360", ".lrv", ".insv")
 _MESSAGES = ("Imu",)  # of sensor_msgs
@@ -448,7 +442,7 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
         raise InputError(f"a rate is {np.degrees(fastest):.3g} deg/s, expected {most}", gyro.path)
     if log.step_s > _SLOWEST_STEP_S:
         raise InputError(f"has a sample each {log.step_s:.2g} s, expected 50 a second or more", path)
-    doubts = (f"{path.name}: {doubt}" for doubt in _doubts(log, gyro, accel))
+    doubts = (f"{path.name}: {doubt}" for doubt in _doubts(log))
     return replace(log, notes=tuple(notes), doubts=tuple(doubts))
 
 
@@ -465,7 +459,7 @@ def _as_sampled(signal: _Signal, notes: list[str]) -> _Signal:
     return replace(signal, times_s=taken_s)
 
 
-def _doubts(log: ImuLog, gyro: _Signal, accel: _Signal) -> Iterator[str]:
+def _doubts(log: ImuLog) -> Iterator[str]:
     """Yield what is not as it should be: gaps, uneven times, few samples, values at the end of the scale."""
     steps_s = np.diff(log.timestamp_s)
     gaps_s = steps_s[steps_s > log.longest_gap_s]
@@ -477,18 +471,9 @@ def _doubts(log: ImuLog, gyro: _Signal, accel: _Signal) -> Iterator[str]:
     uneven = float(np.mean(np.abs(steps_s - log.step_s) > 0.5 * log.step_s))
     if uneven > 0.2:
         yield f"times are uneven: {uneven:.0%} of the steps differ by half from their median, {1e3 * log.step_s:.1f} ms"
-    for signal, full_scales in ((gyro, _FULL_SCALES_RAD_S), (accel, _FULL_SCALES_M_S2)):
-        if num_clipped := _num_clipped(signal.values, full_scales):
-            yield f"{num_clipped} samples of the {signal.kind} are at the end of its scale: record with a larger one"
-
-
-def _num_clipped(values: Array, full_scales: Array) -> int:
-    """Return how many samples are an axis's extreme value, where that is a full scale and three in a row have it."""
-    num = 0
-    for axis in values.T:
-        for extreme in (axis.max(), axis.min()):
-            is_full = np.any(np.abs(np.abs(extreme) / full_scales - 1) < _FULL_SCALE_ERROR)
-            repeats = axis == extreme
-            run = repeats[2:] & repeats[1:-1] & repeats[:-2]
-            num += int(np.count_nonzero(repeats)) if is_full and run.any() else 0
-    return num
+    for sensor, num_clipped in zip(("gyroscope", "accelerometer"), np.count_nonzero(log.clipped, axis=0), strict=True):
+        if num_clipped:
+            yield (
+                f"{num_clipped} of {len(log)} samples of the {sensor} are at the end of its scale; the motion between "
+                "the photos before and after them is not used: record with a larger scale"
+            )

@@ -174,7 +174,12 @@ class InertialProblem:
             is_apart = times_s[-1] < log.timestamp_s[0] or times_s[0] > log.timestamp_s[-1]
             why = "and the photos have no time in common" if is_apart else "does not tell how the photos turn"
             raise GeometryError(f"the log of the inertial sensor {why}")
-        return found
+        is_clipped = log.is_clipped_between(times_s[found.before], times_s[found.after])
+        if is_clipped.all():
+            raise GeometryError(
+                "the inertial sensor was at the end of its scale between all photos: record with a larger scale"
+            )
+        return found.subset(np.flatnonzero(~is_clipped))
 
     def linearized(self, state: InertialState, intervals: Preintegrated) -> LinearMotion:
         """Return the errors of the intervals at a state, with their derivatives."""

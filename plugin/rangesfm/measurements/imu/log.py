@@ -18,6 +18,15 @@ _NUM_IN_STRETCH = 1000
 _LATE = 0.25
 # Steps that differ more than this from their median, in steps, are not those of a sensor's own clock.
 _UNEVEN = 0.25
+STANDARD_GRAVITY_M_S2 = 9.80665
+# Full scales of accelerometers in g and of gyroscopes in deg/s, as data sheets of MEMS sensors give them; the factory's
+# scale factors differ by some percent.
+_FULL_SCALES_M_S2 = STANDARD_GRAVITY_M_S2 * np.array([2.0, 4.0, 8.0, 16.0])
+_FULL_SCALES_RAD_S = np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0])
+_FULL_SCALE_ERROR = 0.03
+# A motion comes to exactly the same extreme once. A sensor at the end of its scale holds it for three samples or more,
+# and comes to it so many times; where the extreme is a usual full scale, once is enough.
+_NUM_TIMES = 3
 
 
 def times_of_sampling(arrived_s: Array) -> Array | None:
@@ -113,6 +122,20 @@ class ImuLog:
         """Name of the file, for messages."""
         return Path(self.path).name or "the inertial sensor"
 
+    @cached_property
+    def clipped(self) -> Mask:
+        """(k, 2) whether gyroscope and accelerometer were at the end of their scale in any axis at each sample."""
+        scales = (self.gyro_rad_s, _FULL_SCALES_RAD_S), (self.accel_m_s2, _FULL_SCALES_M_S2)
+        return np.column_stack([_is_clipped(values, full_scales) for values, full_scales in scales])
+
+    def is_clipped_between(self, from_s: Array, to_s: Array) -> Mask:
+        """Return whether a sensor was at the end of its scale between two times (n,) each, or right before or after."""
+        before = np.cumsum(np.append(0, self.clipped.any(axis=1)))
+        first = np.searchsorted(self.timestamp_s, from_s, side="right") - 1
+        last = np.searchsorted(self.timestamp_s, to_s, side="left")
+        num = len(self)
+        return np.asarray(before[np.clip(last + 1, 0, num)] > before[np.clip(first, 0, num)])
+
     @property
     def step_s(self) -> float:
         """Median time between samples."""
@@ -198,3 +221,16 @@ class ImuLog:
         seconds = fraction * (self.timestamp_s[before + 1] - self.timestamp_s[before])
         middle = self._at_samples[before] * Rotation.from_rotvec(0.5 * fraction[:, None] * self._steps[before])
         return np.asarray(self._summed[before] + middle.as_matrix() * seconds[:, None, None])
+
+
+def _is_clipped(values: Array, full_scales: Array) -> Mask:
+    """Return whether an axis (k, 3) has its extreme value, where that is the end of a scale; (k,)."""
+    found = np.zeros(len(values), dtype=bool)
+    for axis in values.T:
+        for extreme in (axis.max(), axis.min()):
+            is_there = axis == extreme
+            held = is_there[2:] & is_there[1:-1] & is_there[:-2]
+            num_times = np.count_nonzero(np.diff(held.astype(np.int8), prepend=0) == 1)
+            is_full = np.any(np.abs(np.abs(extreme) / full_scales - 1) < _FULL_SCALE_ERROR)
+            found |= is_there & (num_times >= (1 if is_full else _NUM_TIMES))
+    return found
