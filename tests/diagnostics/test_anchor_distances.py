@@ -84,7 +84,15 @@ def test_ranges_in_feet_are_named() -> None:
 
 def test_an_anchor_that_stands_elsewhere_is_named() -> None:
     found = note(log_of_walk(), {**SITE_M, "C": (8.0, 44.0, 0.8)})
-    assert "anchor C stands elsewhere" in found
+    assert "anchor C stands elsewhere;" in found
+
+
+@pytest.mark.parametrize(("times", "unit"), [(100, "centimetres"), (1000, "millimetres")])
+def test_one_anchor_in_another_unit_is_named_with_it(times: int, unit: str) -> None:
+    x, y, z = SITE_M["C"]
+    found = note(log_of_walk(), {**SITE_M, "C": (times * x, times * y, times * z)})
+    assert f"anchor C stands elsewhere, or its coordinates are in {unit} and the others' in metres" in found
+    assert "anchor C stands elsewhere;" in note(log_of_walk(), {**SITE_M, "C": (times * x, y, z)})
 
 
 def test_swapped_labels_are_named() -> None:

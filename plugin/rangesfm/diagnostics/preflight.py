@@ -322,7 +322,8 @@ def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: 
     in_pairs = bad.sum(axis=0) + bad.sum(axis=1)
     if in_pairs.max() == bad.sum():
         ends = [ids[k] for k in np.flatnonzero(in_pairs == bad.sum()).tolist()]
-        yield f"anchor {' or '.join(ends)} stands elsewhere"
+        unit = _unit_of_one(positions_m, in_pairs == bad.sum()) if len(ends) == 1 else ""
+        yield f"anchor {' or '.join(ends)} stands elsewhere{unit}"
     for what, of_metre in (("anchors", -1), ("ranges", 1)):  # ranges in another unit are as if the anchors' were one
         for unit, words in _UNITS.items():
             if not triangles.bad_pairs(UNITS_PER_METRE[unit] ** of_metre * positions_m).any():
@@ -335,6 +336,25 @@ def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: 
             swaps.append(f"the labels {ids[i]} and {ids[k]} are swapped")
     # If many swaps explain the contradictions, none of them is reported.
     yield from swaps if len(swaps) <= _MAX_NUM_NAMED else ()
+
+
+def _unit_of_one(positions_m: Array, is_it: Mask) -> str:
+    """Return what is to be said of an anchor whose coordinates are among the others' if read in a smaller unit, or "".
+
+    Args:
+        positions_m: (n, 3). is_it: (n,) true for the anchor.
+    """
+    others_m = positions_m[~is_it]
+    margin_m = np.ptp(others_m, axis=0).max()
+    low_m, high_m = others_m.min(axis=0) - margin_m, others_m.max(axis=0) + margin_m
+    at_m = positions_m[is_it][0]
+    if np.count_nonzero((at_m < low_m) | (at_m > high_m)) < 2:  # a lost decimal point in one of them
+        return ""
+    for unit in ("cm", "mm"):
+        read_m = at_m / UNITS_PER_METRE[unit]
+        if np.all((read_m >= low_m) & (read_m <= high_m)):
+            return f", or its coordinates are in {_UNITS[unit]} and the others' in metres"
+    return ""
 
 
 def _triangles(log: RangeLog, ids: Sequence[str]) -> _Triangles:

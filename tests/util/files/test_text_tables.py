@@ -115,6 +115,11 @@ def test_rows_have_as_many_cells_as_the_header(tmp_path: Path, row: str, num: st
     assert f"has {num} the header row has 2" in str(error)
 
 
+def test_empty_cells_at_the_end_of_rows_are_no_cells(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path, "a,b\n1,2,\n3,,, \n"), ["a", "b"])
+    assert (table.text("a"), table.text("b", empty="none")) == (["1", "3"], ["2", "none"])
+
+
 def test_missing_column_names_what_was_found_and_expected(tmp_path: Path) -> None:
     error = refusal(write(tmp_path, "# c\na,c\n1,2\n"))
     assert error.line == 2

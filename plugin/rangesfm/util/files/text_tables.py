@@ -214,6 +214,8 @@ def read_table(
         if row == header_row:  # in joined files the header row is repeated
             continue
         cells = _split_row(row, separator, path, line)
+        while len(cells) > len(names) and not cells[-1].strip():  # spreadsheets end rows with empty cells
+            cells.pop()
         if len(cells) != len(names):
             raise InputError(f"has {num_cells(cells)}, the header row has {len(names)}", path, line)
         lines.append(line)

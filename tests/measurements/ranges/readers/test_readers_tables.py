@@ -104,6 +104,9 @@ LONG = {
         "e+0", "e+00"
     ),
     "quoted": lines('"time","anchor","range"', lambda t, a, r: f'"{t:.3f}","{a}","{r:.3f}"'),
+    "years of two digits": lines(
+        "Zeit;Anker;Abstand", lambda t, a, r: f"31.01.26 {clock(t)};{a};" + f"{r:.3f}".replace(".", ",")
+    ),
     "day first": lines("when,anchor,range", lambda t, a, r: f"31/01/2026 {clock(t)},{a},{r:.3f}"),
     "month first, in halves of a day": lines(
         "time,anchor,range", lambda t, a, r: f"1/31/2026 {clock(t)[1:]} PM,{a},{r:.3f}"

@@ -33,6 +33,7 @@ _WITH_MONTH = re.compile(
     rf"(\d\d?)[- ]({'|'.join(_MONTHS)})[a-z]{{0,6}}[- ](\d{{4}})(?=$|[T _])", re.ASCII | re.IGNORECASE
 )
 _AS_EXIF = re.compile(r"(\d{4}):(\d\d):(\d\d)(?=[T ]\d\d?:)", re.ASCII)  # 2026:01:31 12:00:00
+_SHORT_YEAR = re.compile(r"(\d\d?)\.(\d\d?)\.(\d\d)(?=$|[T _]\d\d?:)", re.ASCII)  # 31.01.26 12:00:00
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 _DAY_S = 86400.0
 # The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
@@ -45,12 +46,17 @@ def unit_by_digits(value: float) -> str | None:
 
 
 def spelt_date(text: str) -> str | None:
-    """Convert a date of digits alone, with colons as in EXIF, or with the month in words to 2026-01-31; else None."""
+    """Convert a date of digits alone, with colons as in EXIF, or with the month in words to 2026-01-31; else None.
+
+    So are dates with points and a year of two digits: 31.01.26.
+    """
     if compact := _COMPACT.fullmatch(text):
         year, month, day, hour, minute, second, fraction, zone = compact.groups()
         return f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction or 0}{zone}"
     if exif := _AS_EXIF.match(text):
         return f"{exif[1]}-{exif[2]}-{exif[3]}{text[exif.end() :]}"
+    if short := _SHORT_YEAR.match(text):
+        return f"20{short[3]}-{short[2]:>02}-{short[1]:>02}{text[short.end() :]}"
     if named := _WITH_MONTH.match(text):
         return f"{named[3]}-{_MONTHS.index(named[2].lower()) + 1:02}-{named[1]:>02}{text[named.end() :]}"
     return None
