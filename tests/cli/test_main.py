@@ -25,10 +25,6 @@ def run(*command: str, cwd: Path | None = None) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, check=False)
 
 
-def rangesfm_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return run(sys.executable, "-m", "rangesfm", *arguments, cwd=cwd)
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "uwb.csv").write_text(LOG)
@@ -106,15 +102,6 @@ def test_help_is_quick_and_needs_none_of_the_heavy_packages(argv: list[str], hea
     """The definitions of the survey keys are imported only by the command that needs them."""
     code = f"import sys; from rangesfm.cli import main; main({argv}); sys.exit(bool(set({heavy}) & set(sys.modules)))"
     assert run(sys.executable, "-c", code).returncode == 0
-
-
-def test_module_runs_as_a_command(folder: Path) -> None:
-    done = rangesfm_command("ranges", "uwb.csv", cwd=folder)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "format  canonical" in done.stdout
-    failed = rangesfm_command("ranges", "none.csv", cwd=folder)
-    assert (failed.returncode, failed.stdout) == (2, "")
-    assert failed.stderr == "rangesfm: error: none.csv: no such file\n"
 
 
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,7 +13,6 @@ from tests.simulated.path import orbit_path
 from rangesfm.errors import SolverError
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bundle_adjustment import (
-    BundleAdjustment,
     bundle_adjustment,
 )
 
@@ -49,12 +47,7 @@ def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:
             assert model.image(element.image_id).point2D(element.point2D_idx).point3D_id == point_id
 
 
-def a_bundle(model: pycolmap.Reconstruction | None = None, **options: Any) -> BundleAdjustment:
-    given = {"camera": CameraOptions(), "options": RefineOptions(), "num_threads": 1}
-    return bundle_adjustment(orbit() if model is None else model, **{**given, **options})
-
-
 def test_a_model_without_points_that_take_part_is_refused() -> None:
     model = orbit()
     with pytest.raises(SolverError, match="no point of the model takes part in the bundle adjustment"):
-        a_bundle(model, left_out_ids=list(model.points3D))
+        bundle_adjustment(model, CameraOptions(), RefineOptions(), num_threads=1, left_out_ids=list(model.points3D))

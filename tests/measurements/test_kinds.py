@@ -14,7 +14,6 @@ from tests.measurements.conftest import KINDS, Scene, marker_of, moved
 from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
 from rangesfm.measurements.marks import add_marks, remove_marks
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bundle_adjustment import bundle_adjustment
 from rangesfm.util.geometry.trajectory import pose_of
@@ -90,18 +89,6 @@ def test_the_compiled_cost_is_that_of_the_weights(name: str, scene: Scene) -> No
     np.testing.assert_allclose(np.sort(found), np.sort(expected), rtol=1e-6)
     assert expected.sum() > 0
     remove_marks(model, ids)
-
-
-def test_ranges_of_one_place_and_anchor_are_one_residual_block(scene: Scene) -> None:
-    ranges, model = scene.kinds["range"], pycolmap.Reconstruction(scene.model)
-    assert isinstance(ranges, Ranges)
-    adjustment = bundle_adjustment(model, CameraOptions(refine_intrinsics=False), RefineOptions(), num_threads=1)
-    problem = adjustment.adjuster.problem
-    before, at, log = problem.num_residual_blocks(), ranges.places.subset(ranges.rows), ranges.observations.log
-    poses = [pose_of(model.frame(int(frame_id))).params for frame_id in scene.path.frame_ids]
-    ranges.add_to(adjustment, poses, {block: at.copy() for block, at in scene.state.blocks.items()})
-    places = set(zip(at.before, at.after, log.anchor_index[ranges.rows], strict=True))
-    assert problem.num_residual_blocks() - before == len(places) < len(ranges.rows)
 
 
 def test_rays_of_exact_marks_meet_in_the_point(scene: Scene) -> None:

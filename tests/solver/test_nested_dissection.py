@@ -61,13 +61,6 @@ def test_it_solves_and_inverts_like_dense_algebra(name: str) -> None:
         np.testing.assert_allclose(block, inverse[first:end, first:end], atol=1e-13)
 
 
-def test_a_dense_matrix_is_one_front() -> None:
-    matrix, starts = problem(field(4), np.full(16, 3))
-    right = np.ones(len(matrix))
-    factor = NestedFactor(matrix.copy(), starts, np.zeros(16, dtype=bool))
-    np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix, right), atol=1e-13)
-
-
 def test_the_cost_of_a_field_grows_far_slower_than_that_of_a_dense_matrix() -> None:
     small, large = (cost_of_factor(field(side)) for side in (12, 24))
     assert large / small < 4**2  # the factor of a dense one is 64

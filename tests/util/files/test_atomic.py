@@ -149,13 +149,6 @@ def test_no_output_is_an_input_or_inside_one(output: str, tmp_path: Path) -> Non
 
 
 class TestScratchFolder:
-    def test_is_there_and_then_gone(self, tmp_path: Path) -> None:
-        with scratch_folder(tmp_path / "a") as folder:
-            (folder / "file").write_text("x")
-            assert folder.stat().st_dev == tmp_path.stat().st_dev
-            assert names_in(tmp_path) == []
-        assert list(tmp_path.iterdir()) == []
-
     @pytest.mark.parametrize("when", ["made", "used", "removed"])
     def test_is_gone_after_ctrl_c(self, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def make_and_interrupt(path: Path, *arguments: Any, **options: Any) -> None:

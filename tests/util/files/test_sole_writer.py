@@ -19,7 +19,6 @@ from tests.result_document import result_document
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.util.files.atomic import new_file, new_folder
 from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME, sole_writer
 
 if TYPE_CHECKING:
@@ -200,9 +199,3 @@ def test_where_there_are_no_locks_what_another_process_has_in_the_making_stays(
         other.touch()
     with sole_writer(tmp_path):
         assert list(own.parent.iterdir()) == [other]
-
-
-def test_what_is_made_inside_is_not_cleared_away(tmp_path: Path) -> None:
-    with sole_writer(tmp_path), new_folder(tmp_path / "a") as folder, new_file(folder / "x") as file:
-        file.touch()
-    assert (tmp_path / "a" / "x").exists()
