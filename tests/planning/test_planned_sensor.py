@@ -32,7 +32,7 @@ num_rounds = 2
 @pytest.mark.parametrize(("motion", "seed"), [(by_hand(1), 1), (by_drone(3), 3)], ids=["hand", "drone"])
 def test_where_errors_have_the_same_sizes_a_plan_states_what_a_run_states(motion: Motion, seed: int) -> None:
     path, log = photos(motion, noise_rad=5e-4, bend=0.002, seed=seed), imu_log(motion, grade=PHONE, seed=seed)
-    sensor = InertialSensor(log).aligned_with(path)
+    sensor = InertialSensor(log).on_path(path)
     assert sensor.alignment is not None
     problem = InertialProblem.of_sensor(sensor, sensor.alignment, WalkBending(path))
     run = scale_by_sensor(problem)

@@ -87,7 +87,7 @@ def made(motion: Motion, grade: Grade, seed: int) -> tuple[ImuLog, Trajectory]:
 
 def located(sensor: InertialSensor, path: Trajectory) -> tuple[InertialScale, str]:
     """Return the sensor on the map, as a run finds it, and the warnings."""
-    aligned = sensor.aligned_with(path)
+    aligned = sensor.on_path(path)
     assert aligned.alignment is not None
     bending = WalkBending(path)
     found = scale_by_sensor(InertialProblem.of_sensor(aligned, aligned.alignment, bending))

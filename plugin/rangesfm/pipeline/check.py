@@ -181,17 +181,9 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
 
 
 def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
-    if inputs.tape.distances:
-        is_alone = survey.metric_keys == ["scale.distances"]
-        only = ", which alone determine the scale (no ranges)" if is_alone else ""
-        yield f"taped distances: {len(inputs.tape.distances)}{only}"
-    yield from inputs.positions.facts()
-    if (imu := inputs.imu) is not None:
-        times_s = imu.log.timestamp_s
-        yield (
-            f"inertial sensor: {len(imu.log)} samples at {1 / imu.log.step_s:.0f} Hz in {imu.log.name}, from "
-            f"{span_text(times_s[0], times_s[-1])}"
-        )
+    facts = [fact for each in inputs.beside_ranges for fact in each.facts()]
+    is_alone = len(facts) == len(survey.metric_keys) == 1 and not len(inputs.log)
+    yield from (f"{fact}{', which alone determine the scale (no ranges)' * is_alone}" for fact in facts)
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
         yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"

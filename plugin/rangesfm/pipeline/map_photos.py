@@ -35,7 +35,7 @@ from rangesfm.sfm.rigs import read_rigs
 from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
 from rangesfm.sfm.tags import find_tags, names_of_tags, sides_of_tags
 from rangesfm.sfm.unpublished import UnpublishedReconstruction
-from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.kinds_in_map import read_all_kinds
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.extract import TIMES_NAME, take_photos
@@ -81,7 +81,7 @@ def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
     with survey.source.naming_lines():
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey)
-    inputs = read_ranging_inputs(survey)
+    inputs = read_all_kinds(survey)
     notes = [*notes_before_work(survey, inputs)]  # it ends the run where a unit is wrong
     journal.note(*inputs.assumed)
     journal.warn(*inputs.notes, *notes)

@@ -12,7 +12,7 @@ from rangesfm.comparison.model_ranges import ModelRanges
 from rangesfm.measurements.ranges.range_observations import USED
 from rangesfm.pipeline.run import map_of_model
 from rangesfm.progress import SILENT, Journal
-from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.kinds_in_map import read_all_kinds
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
@@ -34,7 +34,7 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
         GeometryError: the ranges do not determine the time offset or the scale of the model.
     """
     survey = survey.changed({"images.model": model_path.absolute()})
-    run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
+    run = SurveyRun(survey, read_all_kinds(survey), Journal(SILENT))
     times = {} if isinstance(run.inputs.log.moments, ByPhoto) else times_of_model(survey, model, model_path).by_name()
     metric = map_of_model(run, model, refine=False)
     log = metric.observations.log

@@ -14,6 +14,8 @@ from typing import TypeVar
 import pycolmap
 
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.measurements.kind_as_read import KindAsRead
+from rangesfm.measurements.kinds_in_words import KINDS_IN_WORDS
 from rangesfm.measurements.lengths.locate_lengths import locatable
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.pipeline.close_loops import close_loops_of_models
@@ -43,7 +45,6 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.geometry.gravity import gravity_of
-from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.trajectory import Trajectory
 from rangesfm.util.processes.threads import at_most, with_one_blas_thread
 
@@ -169,18 +170,20 @@ def map_in_metres(
 
 def _with_clocks(run: SurveyRun, path: Trajectory) -> SurveyRun:
     """Return the survey with the clocks of its sensors, as found on a path; errors are those of ``_or_left_out``."""
-    positions, imu = run.inputs.positions, run.inputs.imu
-    timed, without = partial(positions.timed_on, path), replace(positions, antenna=None)
+    positions, others = run.inputs.positions, dict[str, KindAsRead]()
+    timed, without = partial(positions.on_path, path), replace(positions, antenna=None)
     positions = _or_left_out(run, "positions.path", "positions of the antenna are", timed, without)
-    run.journal.warn(*positions.notes_on_clock)
-    if imu is not None:
-        imu = _or_left_out(run, "imu.path", "inertial sensor is", partial(imu.aligned_with, path), None)
-    if imu is not None and (found := imu.alignment) is not None:
-        run.journal.warn(*found.mistakes)
-        half_s = NORMAL_95 * found.time_offset_stddev_s
-        offset = f"{found.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
-        run.journal.note(f"time offset of the inertial sensor: {offset}, by {len(found.turns)} turns of the photos")
-    inputs, doubts = replace(run.inputs, positions=positions, imu=imu), tuple(positions.doubts_of_clock)
+    run.journal.warn(*positions.warnings_on_path)
+    for words in KINDS_IN_WORDS:
+        if (each := run.inputs.others.get(words.kind)) is None:
+            continue
+        what = f"{words.words} {words.verb}"
+        found = _or_left_out(run, f"{words.kind}.path", what, partial(each.on_path, path), None)
+        if found is not None:
+            run.journal.warn(*found.warnings_on_path)
+            run.journal.note(*found.notes_on_path)
+            others[words.kind] = found
+    inputs, doubts = replace(run.inputs, positions=positions, others=others), tuple(positions.doubts_of_clock)
     return replace(run, inputs=inputs, doubts=doubts)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -12,7 +13,7 @@ from scipy.spatial.distance import cdist
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.clock.offset import TimeOffset
-from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
+from rangesfm.measurements.kind_as_read import KindAsRead
 from rangesfm.measurements.lengths.tape import Marker, Tape
 from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_markers, read_tape
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
@@ -44,6 +45,9 @@ _UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
 _WITHOUT_ONE = 0.25
 
 
+_Kind = TypeVar("_Kind", bound=KindAsRead)
+
+
 @dataclass(frozen=True)
 class RangingInputs:
     """Inputs measured in metres: those of the radio, lengths, and true positions.
@@ -60,7 +64,7 @@ class RangingInputs:
         reference: true positions; empty if not given.
         assumed: lines about how the files were read.
         positions: known positions of marks, in the frame of the anchors.
-        imu: inertial sensor on the camera; None without one.
+        others: of the kinds of measurement that share nothing with these, by their names.
     """
 
     log: RangeLog
@@ -73,12 +77,21 @@ class RangingInputs:
     notes: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
-    imu: InertialSensor | None = None
+    others: Mapping[str, KindAsRead] = field(default_factory=dict)
 
     @property
     def needs_times(self) -> bool:
-        """True if the photos' times are needed, for ranges or positions by time, or for an inertial sensor."""
-        return isinstance(self.log.moments, ByTime) or self.positions.needs_times or self.imu is not None
+        """True if the photos' times are needed, for ranges by time or for another kind."""
+        return isinstance(self.log.moments, ByTime) or any(each.needs_times for each in self.beside_ranges)
+
+    @property
+    def beside_ranges(self) -> tuple[KindAsRead, ...]:
+        """All that was read of each kind of measurement but ranges."""
+        return (self.tape, self.positions, *self.others.values())
+
+    def of_kind(self, kind: type[_Kind]) -> _Kind | None:
+        """Return what was read of one of the other kinds; None without any."""
+        return next((each for each in self.others.values() if isinstance(each, kind)), None)
 
     @property
     def may_be_left_out(self) -> bool:
@@ -112,7 +125,7 @@ def _photos_of(markers: Mapping[str, Marker]) -> tuple[str, ...]:
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:
-    """Read and check all inputs but the photos.
+    """Read and check all inputs but the photos, and but the kinds of measurement that share nothing with ranges.
 
     Raises:
         InputError: a file is missing or wrong, or the log has an anchor that the file of anchors has not, or a tag
@@ -145,8 +158,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances).with_more_markers(markers)
     reference = NO_REFERENCE if survey.report.reference is None else read_true_positions(survey.report.reference)
-    imu = read_sensor(survey.imu)
-    notes = (*_warnings(log, anchors, survey), *curve_notes, *(() if imu is None else imu.log.doubts))
+    notes = (*_warnings(log, anchors, survey), *curve_notes)
     assumed = (
         *log.notes,
         *_kinds_of_ranges(log),
@@ -155,10 +167,9 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         *positions.notes,
         *tape.notes,
         *reference.notes,
-        *(() if imu is None else imu.log.notes),
     )
     log = log.in_time_order()
-    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions, imu)
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)
 
 
 def _read_radio(survey: Survey) -> tuple[RangeLog, tuple[Anchor, ...], tuple[str, ...]]:

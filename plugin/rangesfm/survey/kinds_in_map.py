@@ -14,9 +14,11 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
+from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
 from rangesfm.measurements.imu.words import IMU_WORDS
 from rangesfm.measurements.joint_map import KindOnMap, Located, find_kind, upward_by
 from rangesfm.measurements.kind import Block, Measurements
+from rangesfm.measurements.kind_as_read import KindAsRead
 from rangesfm.measurements.kind_words import KindWords
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
@@ -37,7 +39,7 @@ from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.range_start import RangesAtRest, RangesOnPath
 from rangesfm.measurements.ranges.words import RANGE_WORDS
 from rangesfm.solver.bending import MapBending
-from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -122,9 +124,10 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
 
 
 def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
-    if inputs.imu is None or inputs.imu.alignment is None:
+    sensor = inputs.of_kind(InertialSensor)
+    if sensor is None or sensor.alignment is None:
         return None
-    return scale_by_sensor(InertialProblem.of_sensor(inputs.imu, inputs.imu.alignment, at.bending))
+    return scale_by_sensor(InertialProblem.of_sensor(sensor, sensor.alignment, at.bending))
 
 
 @dataclass(frozen=True)
@@ -133,19 +136,31 @@ class Kind:
 
     Attributes:
         words: how people are told of it. locate: returns it in a map; None where it is not in it.
+        read: returns what a survey has of it; None without any, or where ``read_ranging_inputs`` has read it already:
+            ranges, positions and lengths share files and their frame.
     """
 
     words: KindWords
     locate: Callable[[RangingInputs, MapOfPhotos], Located | None]
+    read: Callable[[Survey], KindAsRead | None] = lambda survey: None
 
 
 KINDS = (
     Kind(RANGE_WORDS, _ranges),
     Kind(POSITION_WORDS, _positions),
     Kind(LENGTH_WORDS, _lengths),
-    Kind(IMU_WORDS, _inertial),
+    Kind(IMU_WORDS, _inertial, lambda survey: read_sensor(survey.imu)),
 )
 """All kinds of measurement. The first that is used decides what is doubtful."""
+
+
+def read_all_kinds(survey: Survey) -> RangingInputs:
+    """Read and check all inputs but the photos; errors are those of ``read_ranging_inputs`` and of each kind."""
+    inputs = read_ranging_inputs(survey)
+    others = {kind.words.kind: found for kind in KINDS if (found := kind.read(survey)) is not None}
+    warnings = [line for each in others.values() for line in each.warnings]
+    notes = [line for each in others.values() for line in each.notes]
+    return replace(inputs, others=others, notes=(*inputs.notes, *warnings), assumed=(*inputs.assumed, *notes))
 
 
 def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located, ...], tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +13,15 @@ from rangesfm.measurements.imu.alignment import ImuAlignment, align_imu
 from rangesfm.measurements.imu.calibration import read_imu_noise
 from rangesfm.measurements.imu.formats import read_imu
 from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.kind_as_read import KindAsRead
 from rangesfm.options import ImuOptions
+from rangesfm.util.files.clock_times import span_text
+from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
-class InertialSensor:
+class InertialSensor(KindAsRead):
     """A sensor that is fixed to the camera.
 
     Attributes:
@@ -34,7 +38,39 @@ class InertialSensor:
     cam_from_imu: Array | None = None
     alignment: ImuAlignment | None = None
 
-    def aligned_with(self, path: Trajectory) -> InertialSensor:
+    def facts(self) -> Iterator[str]:
+        """Yield how much the log has, and when it begins and ends."""
+        first_s, last_s = self.log.timestamp_s[[0, -1]]
+        rate_hz, span = 1 / self.log.step_s, span_text(first_s, last_s)
+        yield f"inertial sensor: {len(self.log)} samples at {rate_hz:.0f} Hz in {self.log.name}, from {span}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.log.notes
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.log.doubts
+
+    @property
+    def needs_times(self) -> bool:
+        return True
+
+    @property
+    def notes_on_path(self) -> tuple[str, ...]:
+        """How far the clocks of photos and sensor are apart."""
+        if self.alignment is None:
+            return ()
+        half_s, num = NORMAL_95 * self.alignment.time_offset_stddev_s, len(self.alignment.turns)
+        offset = f"{self.alignment.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
+        return (f"time offset of the inertial sensor: {offset}, by {num} turns of the photos",)
+
+    @property
+    def warnings_on_path(self) -> tuple[str, ...]:
+        """What is wrong with the log or with what was given with it."""
+        return () if self.alignment is None else self.alignment.mistakes
+
+    def on_path(self, path: Trajectory) -> InertialSensor:
         """Return the sensor with its alignment; errors are those of ``align_imu``."""
         found = align_imu(self.log, path, time_offset_s=self.time_offset_s, cam_from_imu=self.cam_from_imu)
         return replace(self, alignment=found)

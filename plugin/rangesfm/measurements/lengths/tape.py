@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.kind_as_read import KindAsRead
 
 CONTROL, CHECK = "control", "check"
 # Kind of a length that contradicts the map and was rejected.
@@ -62,7 +63,7 @@ class Marker:
 
 
 @dataclass(frozen=True)
-class Tape:
+class Tape(KindAsRead):
     """Measured lengths and markers.
 
     Attributes:
@@ -76,6 +77,11 @@ class Tape:
     markers: Mapping[str, Marker] = field(default_factory=dict)
     distances_path: Path | None = None
     notes: tuple[str, ...] = ()
+
+    def facts(self) -> Iterator[str]:
+        """Yield how many lengths there are."""
+        if self.distances:
+            yield f"taped distances: {len(self.distances)}"
 
     def control(self) -> Tape:
         """Return the tape with its control lengths only."""

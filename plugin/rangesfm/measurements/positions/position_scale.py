@@ -392,7 +392,7 @@ def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequ
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
     rows = [*itertools.chain.from_iterable(of_points), *of_antenna, *against]
     rows.sort(key=lambda row: row.threshold - row.statistic)
-    notes = positions.surveyed.notes_on_clock if positions.is_used else ()
+    notes = positions.surveyed.warnings_on_path if positions.is_used else ()
     return MistakeTests(tuple(rows), tuple(reasons), of_place=(*reasons, *notes))
 
 

@@ -10,6 +10,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.kind_as_read import KindAsRead
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
@@ -23,7 +24,7 @@ _OR_DRIFT = ", or these do not meet (by drift of the poses, or as they are of se
 
 
 @dataclass(frozen=True)
-class SurveyedPositions:
+class SurveyedPositions(KindAsRead):
     """Positions in the site's frame: of marks, and of an antenna.
 
     Attributes:
@@ -87,7 +88,7 @@ class SurveyedPositions:
             return marks
         return marks.joined(locate_antenna(self.antenna, path))
 
-    def timed_on(self, path: Trajectory) -> SurveyedPositions:
+    def on_path(self, path: Trajectory) -> SurveyedPositions:
         """Return the positions with the time offset of the antenna's; errors are those of ``find_antenna_offset``."""
         return self if self.antenna is None else replace(self, antenna=find_antenna_offset(self.antenna, path))
 
@@ -113,7 +114,7 @@ class SurveyedPositions:
             )
 
     @property
-    def notes_on_clock(self) -> tuple[str, ...]:
+    def warnings_on_path(self) -> tuple[str, ...]:
         """Why the time offset that was found is doubtful, which moves the map along the path; empty if it is not."""
         offset = None if self.antenna is None else self.antenna.offset
         return () if offset is None or offset.is_certain or not offset.note else (offset.note,)
