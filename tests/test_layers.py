@@ -50,7 +50,10 @@ MODULES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 
-OF_SENSOR = ("inertial_motions", "inertial_fit", "inertial_scale", "motion", "preintegration", "sensor_prior")
+OF_SENSOR = (
+    *("inertial_motions", "inertial_fit", "inertial_scale", "motion", "planned_sensor", "preintegration"),
+    "sensor_prior",
+)
 OF_FIT = ("cost", "gravity", "radio")
 ON_MAP = ("range_scale", "range_start", "length_scale", "position_scale")
 # Modules that say how a kind is measured. Others in the folder of a kind hold what was read.
@@ -156,7 +159,7 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     # The public functions of ranges, and plans, which make measurements instead of locating them.
     of_ranges = {"estimation.scale.initialize", "estimation.with_ranges"}
     of_one_kind = {name for name in MODULES if name.startswith(("measurements.ranges.", "measurements.positions."))}
-    plans = {"planning.planned_kinds", "planning.planned_ranges", "planning.planned_sensor"}
+    plans = {"planning.planned_kinds", "planning.planned_ranges"}
     assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *plans, *of_ranges, *of_one_kind}
     logs = {"measurements.ranges.radio"}  # several kinds are in one log
     others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}

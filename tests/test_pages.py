@@ -31,7 +31,7 @@ from tests.simulated.path import loop_path
 from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.export import EXPORTERS
 from rangesfm.measurements.ranges.readers import reader_names
-from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
+from rangesfm.planning.plan_file import plan_tables
 from rangesfm.survey.settings import KEYS
 from rangesfm.survey.survey_reader import read_survey
 
@@ -223,7 +223,7 @@ def test_the_pages_are_one_tour() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_keys_in_the_text_exist(page: Path) -> None:
-    of_a_plan = {(table, key) for table, model in PLAN_TABLES.items() for key in model.model_fields}
+    of_a_plan = {(table, key) for table, model in plan_tables().items() for key in model.model_fields}
     named = set(re.findall(r"`\[(\w+)\] (\w+)", page.read_text(encoding="utf-8")))
     assert named - {(key.table, key.name) for key in KEYS} - of_a_plan == set()
 

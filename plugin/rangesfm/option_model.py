@@ -128,7 +128,8 @@ class Options(BaseModel):
 
     def __init_subclass__(cls, *, table: str = "", **config: Any):
         super().__init_subclass__(**config)
-        cls.table = table or cls.table
+        if table:
+            cls.table = table
 
     def __init__(self, /, **values: Any):
         values = {name: value for name, value in values.items() if value is not None}  # None: it is not given

@@ -97,7 +97,7 @@ def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None
     room = rng.uniform((-4.0, -3.0, 0.0), (4.0, 3.0, 2.6), size=(500, 3))
     yard = rng.uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 0.4), size=(500, 3))
     for name, points, highest_m in (("room", room, 2.65), ("yard", yard, 1.85)):
-        planned = _levelled(_of_run(path, anchors, "site", np.zeros(3), {}, Site(), None), points, 2000, None)
+        planned = _levelled(_of_run(path, anchors, "site", np.zeros(3), {}, Site(), {}), points, 2000, None)
         assert planned.walls_are == "edge of what the photos show"
         advice = advise(expect(planned))
         assert any(each.kind == "anchor place" for each in advice), name

@@ -14,11 +14,12 @@ from rangesfm.demo.simulated_imu import PHONE
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
+from rangesfm.measurements.imu.planned_sensor import PlannedSensor
 from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.measurements.imu.sensor_prior import NOISE
+from rangesfm.measurements.imu.words import IMU
 from rangesfm.planning.expected import PlannedBending, expect
 from rangesfm.planning.plan_file import read_plan
-from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.solver.bending import WalkBending
 
@@ -58,7 +59,7 @@ def test_a_level_camera_leaves_scale_factors_open_and_tilting_it_gains_what_the_
     tilted = next(advice for advice in plan.advice_for_scale if advice.kind == "tilted camera")
     assert tilted.scale_stddev < 0.6 * plan.expected.uncertainty.empirical
     assert expect(tilted.planned).uncertainty.empirical == pytest.approx(tilted.scale_stddev, rel=0.15)
-    better = expect(replace(tilted.planned, sensor=PlannedSensor(grade="tactical")))
+    better = expect(replace(tilted.planned, others={IMU: PlannedSensor(grade="tactical")}))
     assert better.uncertainty.empirical < expect(tilted.planned).uncertainty.empirical
 
 
@@ -66,7 +67,7 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     survey = planned(FIVE_ANCHORS_M[:3], "site", loop(40.0, 50))
     before = plan_survey(survey)
     advised = next(advice for advice in before.advice_for_scale if advice.kind == "inertial sensor")
-    plan = plan_survey(replace(survey, sensor=PlannedSensor()))
+    plan = plan_survey(replace(survey, others={IMU: PlannedSensor()}))
     assert plan.expected.uncertainty.empirical == pytest.approx(advised.scale_stddev, rel=0.15)
     assert {*plan.by_kind} == {"ranges", "imu"}
     assert plan.by_kind["ranges"].uncertainty.empirical == pytest.approx(before.expected.uncertainty.empirical)
@@ -78,12 +79,12 @@ def test_beside_a_radio_a_sensor_brings_what_is_advised_and_levels_the_map() -> 
     assert not any(advice.kind == "inertial sensor" for advice in plan.advice)
     # Phones differ, so that one whose noise is known to be that of most brings more.
     gyro, accel = NOISE
-    known = replace(survey, sensor=PlannedSensor(gyro_noise=gyro.median, accel_noise=accel.median))
+    known = replace(survey, others={IMU: PlannedSensor(gyro_noise=gyro.median, accel_noise=accel.median)})
     assert expect(known).uncertainty.empirical < plan.expected.uncertainty.empirical
 
 
 def test_a_sensor_with_few_photos_is_refused_alone_and_left_out_beside_a_radio() -> None:
-    few = replace(planned(FIVE_ANCHORS_M, "site", loop(60.0, 8)), sensor=PlannedSensor())
+    few = replace(planned(FIVE_ANCHORS_M, "site", loop(60.0, 8)), others={IMU: PlannedSensor()})
     assert any("inertial sensor is not used: 8 photos" in note for note in expect(few).notes)
     with pytest.raises(GeometryError, match="8 photos do not tell"):
         expect(replace(few, anchors=()))

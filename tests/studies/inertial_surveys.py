@@ -50,10 +50,10 @@ from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS, read_imu
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.planned_sensor import PlannedSensor
 from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_STDDEV
 from rangesfm.planning.expected import PlannedBending
-from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import Trajectory

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import colored_points, level_axes, up_in_world
+from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeStatus
@@ -19,9 +21,9 @@ from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.survey.kinds_in_map import KINDS
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import Similarity
@@ -48,16 +50,16 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     """
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
-    used, imu = np.array(ranges.anchor_id, dtype=str)[ranges.is_used], folder.summary.imu
+    used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
+    others = _others({kind: entry.to_json() for kind, entry in folder.summary.of_kinds.items()})
     if model is None:
         raise InputError("has no metric model, expected a finished result", path)
-    if not len(used) and imu is None:
+    if not len(used) and not others:
         raise InputError("was made without ranges, expected a result with some: a plan takes the radio from them", path)
     trajectory = folder.path_in(model)
     if not is_one_after_the_other(trajectory):
         expected = "expected the result of one survey"
         raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)
-    sensor = None if imu is None else PlannedSensor(gyro_noise=imu.gyro_noise, accel_noise=imu.accel_noise)
     (arm,) = folder.lever_arms_m(ranges.tag_id[:1]) if ranges else np.zeros((1, 3))
     stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
     heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used)}
@@ -66,7 +68,7 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
     on_earth, upward = folder.summary.georeference, None if folder.summary.up is None else folder.summary.up[0]
     site = Site(georeference=None if on_earth is None else on_earth.georeference)
-    planned = _of_run(trajectory, anchors, frame, arm, stddevs_m, site, sensor)
+    planned = _of_run(trajectory, anchors, frame, arm, stddevs_m, site, others)
     return _levelled(planned, colored_points(model)[0], len(used), upward)
 
 
@@ -97,10 +99,8 @@ def with_advice(metric: MetricResult, upward: Gravity | None) -> MetricResult:
         frame, stddevs = _frame(estimate.frame, is_known=is_known), estimate.ranges.error_stddevs
         points_m = colored_points(metric.final)[0]
         site = Site(georeference=metric.inputs.site.georeference)
-        learnt = metric.all_measured.problem.sizes
-        noise = learnt.get("gyro_noise"), learnt.get("accel_noise")
-        sensor = PlannedSensor(gyro_noise=noise[0], accel_noise=noise[1]) if all(noise) else None
-        planned = _of_run(trajectory, anchors, frame, arm, stddevs, site, sensor)
+        others = _others({kind.kind: metric.all_measured.problem.sizes for kind in metric.kinds})
+        planned = _of_run(trajectory, anchors, frame, arm, stddevs, site, others)
         expected = expect(_levelled(planned, points_m, int(used.sum()), metric.upward(upward)))
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
@@ -110,6 +110,12 @@ def with_advice(metric: MetricResult, upward: Gravity | None) -> MetricResult:
     return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
 
 
+def _others(learnt: Mapping[str, Mapping[str, Any]]) -> dict[str, PlannedKind]:
+    """Return plans of the kinds of measurement that have a table of their own, given what was learnt of each kind."""
+    planned = {kind.words.kind: kind.planned for kind in KINDS if kind.planned is not None}
+    return {name: kind.like(learnt[name]) for name, kind in planned.items() if name in learnt}
+
+
 def _of_run(
     trajectory: Trajectory,
     anchors: Sequence[Anchor],
@@ -117,7 +123,7 @@ def _of_run(
     tag_in_cam_m: Array,
     component_stddevs: Mapping[str, float],
     site: Site,
-    sensor: PlannedSensor | None,
+    others: Mapping[str, PlannedKind],
 ) -> PlannedSurvey:
     """Return the survey of a run as a plan in the axes of its map, with assumed times where the photos have none."""
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
@@ -128,7 +134,7 @@ def _of_run(
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
-        sensor=sensor,
+        others=others,
         times_are_known=trajectory.timestamps_s is not None,
         site=site,
     )

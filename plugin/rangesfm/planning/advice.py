@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.preflight import SAME_PLACE_M
 from rangesfm.errors import GeometryError
+from rangesfm.measurements.imu.words import IMU
 from rangesfm.measurements.lengths.tape import CONTROL
 from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
@@ -25,8 +26,8 @@ from rangesfm.planning.paths import NUM_WAVES, way_along
 from rangesfm.planning.placement import LEAST_GAIN, spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.planning.walls import AT_WALL_M, lead_through
+from rangesfm.survey.kinds_in_map import KINDS
 from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -188,16 +189,16 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         for factor in _MORE_OFTEN:
             often = replace(planned, rate_hz=factor * planned.rate_hz)
             yield "rate", "", f"range {factor} times as often", often
-    if planned.sensor is None and planned.times_are_known:
-        sensor = "record the inertial sensor of a phone on the camera"
-        yield "inertial sensor", "", sensor, replace(planned, sensor=PlannedSensor())
-    if planned.sensor is not None:
+    for kind, more in ((kind.words, kind.planned) for kind in KINDS if planned.times_are_known):
+        if more is not None and more.advice and kind.kind not in planned.others:
+            yield kind.words, "", more.advice, replace(planned, others={**planned.others, kind.kind: more()})
+    if IMU in planned.others:
         tilt = f"tilt the camera up, down and to the sides on the way, by {_TILTED_DEG:g} degrees, {NUM_WAVES} times"
         yield "tilted camera", "", tilt, replace(planned, trajectory=_tilted(path))
     yield from _with_control_points(planned)
     length_m, stddev_m = _TAPED_M
     tape = f"tape a length of {length_m:g} m to {1000 * stddev_m:g} mm between two points of the map"
-    if planned.anchors or planned.sensor is not None:
+    if planned.anchors or planned.others:
         yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
 
 

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
 from rangesfm.measurements.lengths.tape import CONTROL
+from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.measurements.positions.control_point_file import read_control_points
 from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
@@ -24,7 +25,7 @@ from rangesfm.planning.placement import places_in_box, places_on_walls, spread_a
 from rangesfm.planning.plan_checks import oddities, require_possible
 from rangesfm.planning.planned import Coordinate, Place, PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
-from rangesfm.planning.planned_sensor import PlannedSensor
+from rangesfm.survey.kinds_in_map import KINDS
 from rangesfm.survey.survey_reader import parse_toml, refuse_unknown_tables, with_absolute_paths
 from rangesfm.util.files.contents import AnyPath
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -139,18 +140,15 @@ class PlannedRadioOptions(RangeModelOptions, table="radio"):
     """Standard deviations of components of the range errors, named as in result.json (default: those of like)."""
 
 
-PLAN_TABLES: dict[str, type[Options]] = {
-    "anchors": PlannedAnchorOptions,
-    "path": PlannedPathOptions,
-    "radio": PlannedRadioOptions,
-    "tag": TagOptions,
-    "photos": PlannedPhotos,
-    "points": PlannedPointOptions,
-    "positions": PlannedAntenna,
-    "imu": PlannedSensor,
-}
+_TABLES: tuple[type[Options], ...] = (PlannedAnchorOptions, PlannedPathOptions, PlannedRadioOptions, TagOptions)
 # Tables that say nothing where they are missing.
-_OPTIONAL_TABLES = ("photos", "points", "positions", "imu")
+_OPTIONAL_TABLES: tuple[type[Options], ...] = (PlannedPhotos, PlannedPointOptions, PlannedAntenna)
+
+
+def plan_tables() -> dict[str, type[Options]]:
+    """Return the tables of a plan file, by name."""
+    of_kinds = (kind.planned for kind in KINDS if kind.planned is not None)
+    return {table.table: table for table in (*_TABLES, *_OPTIONAL_TABLES, *of_kinds)}
 
 
 def read_plan(path: AnyPath) -> PlannedSurvey:
@@ -163,11 +161,12 @@ def read_plan(path: AnyPath) -> PlannedSurvey:
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent
     with source.naming_lines():
-        refuse_unknown_tables(tables, PLAN_TABLES)
+        known = plan_tables()
+        refuse_unknown_tables(tables, known)
         options: dict[str, Any] = {
             name: model(**with_absolute_paths(tables.get(name, {}), model, folder))
-            for name, model in PLAN_TABLES.items()
-            if name not in _OPTIONAL_TABLES or name in tables
+            for name, model in known.items()
+            if model in _TABLES or name in tables
         }
         planned = _planned(**options)
         odd = _checked(planned, options["anchors"], options["path"], options.get("points"))
@@ -206,7 +205,7 @@ def _planned(
     photos: PlannedPhotos | None = None,
     points: PlannedPointOptions | None = None,
     positions: PlannedAntenna | None = None,
-    imu: PlannedSensor | None = None,
+    **others: PlannedKind,
 ) -> PlannedSurvey:
     if tag.lever_arms_m:
         raise tag.refused("lever_arms_m", "is given, expected tag_in_cam_m: a plan has one tag")
@@ -215,7 +214,7 @@ def _planned(
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
         raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
     has_positions = points is not None or positions is not None
-    has_others = has_positions or imu is not None
+    has_others = has_positions or bool(others)
     if has_positions and anchors.frame == "first_camera":
         raise anchors.refused("frame", "is 'first_camera', expected site or unknown beside [points] and [positions]")
     allowed_m = _allowed(anchors)
@@ -231,7 +230,7 @@ def _planned(
         photos=photos,
         points=() if points is None else _points(points),
         antenna=positions,
-        sensor=imu,
+        others=others,
         heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from rangesfm.arrays import Array
+from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
 from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.measurements.positions.known_positions import KnownPositions
@@ -19,7 +20,6 @@ from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.option_model import Options
 from rangesfm.options import RangeModelOptions, RangesOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.planning.planned_sensor import PlannedSensor
 from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import Trajectory
@@ -68,7 +68,7 @@ class PlannedSurvey:
         path_is_level: whether the camera cannot go up and down, as on a rover.
         photos: field of view and features of the camera; None: the map bends as maps of poses usually do.
         points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
-        sensor: inertial sensor on the camera; None without one.
+        others: other kinds of measurement, by name.
         allowed_m: (k, 3) allowed places for anchors; empty: not given.
         walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
         walls_are: what the walls are, in words.
@@ -92,7 +92,7 @@ class PlannedSurvey:
     photos: PlannedPhotos | None = None
     points: tuple[ControlPoint, ...] = ()
     antenna: PlannedAntenna | None = None
-    sensor: PlannedSensor | None = None
+    others: Mapping[str, PlannedKind] = field(default_factory=dict)
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
     allowed_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -139,20 +139,21 @@ class PlannedSurvey:
     @property
     def by_kind(self) -> dict[str, PlannedSurvey]:
         """The survey with each kind of measurement alone, by its name."""
-        nothing = replace(self, anchors=(), points=(), antenna=None, sensor=None, taped=())
+        nothing = replace(self, anchors=(), points=(), antenna=None, others={}, taped=())
         alone = {
             "ranges": replace(nothing, anchors=self.anchors),
             "positions": replace(nothing, points=self.points, antenna=self.antenna),
             "lengths": replace(nothing, taped=self.taped),
-            "imu": replace(nothing, sensor=self.sensor),
         }
-        is_any = (self.anchors, self.points or self.antenna, self.taped, self.sensor)
-        return {kind: each for (kind, each), has in zip(alone.items(), is_any, strict=True) if has}
+        is_any = (self.anchors, self.points or self.antenna, self.taped)
+        given = {kind: each for (kind, each), has in zip(alone.items(), is_any, strict=True) if has}
+        return given | {kind: replace(nothing, others={kind: each}) for kind, each in self.others.items()}
 
     @property
     def given_sizes(self) -> Mapping[str, float]:
         """Sizes of components of the errors that are known better than from other surveys, by name."""
-        return self.component_stddevs if self.sensor is None else {**self.sensor.sizes, **self.component_stddevs}
+        of_others = {name: size for each in self.others.values() for name, size in each.sizes.items()}
+        return {**of_others, **self.component_stddevs}
 
     @property
     def num_alike(self) -> int:

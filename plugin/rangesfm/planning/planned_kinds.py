@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.joint_map import KindOnMap
+from rangesfm.measurements.kind_words import KindWords
+from rangesfm.measurements.kinds_in_words import KINDS_IN_WORDS
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.lengths.words import LENGTH_WORDS
 from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.positions.words import POSITION_WORDS
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.planned_ranges import ranges_at_truth
@@ -40,16 +45,21 @@ def kinds_at_truth(planned: PlannedSurvey, bending: MapBending) -> tuple[tuple[K
         begun = PositionScale.begun(known, bending, surveyed, is_at_rest=True)
         return scale_by_positions(begun) if len(known) else None
 
-    locate: dict[str, Callable[[], KindOnMap | None]] = {
-        "known positions are": positions,
-        "taped lengths are": lambda: _lengths(planned, bending),
-        "inertial sensor is": lambda: None if planned.sensor is None else planned.sensor.on_map(bending),
-    }
-    for words, located in locate.items():
+    others = [
+        (words, partial(planned.others[words.kind].on_map, bending))
+        for words in KINDS_IN_WORDS
+        if words.kind in planned.others
+    ]
+    locate: list[tuple[KindWords, Callable[[], KindOnMap | None]]] = [
+        (POSITION_WORDS, positions),
+        (LENGTH_WORDS, partial(_lengths, planned, bending)),
+        *others,
+    ]
+    for words, located in locate:
         try:
             found += [each for each in (located(),) if each is not None]
         except GeometryError as error:
-            notes.append(f"the {words} not used: {error}")
+            notes.append(words.not_used(error))
     if planned.anchors:
         found.insert(0, ranges_at_truth(planned, bending, found))
     if not found:

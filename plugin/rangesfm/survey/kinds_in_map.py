@@ -14,6 +14,7 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
+from rangesfm.measurements.imu.planned_sensor import PlannedSensor
 from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
 from rangesfm.measurements.imu.words import IMU_WORDS
 from rangesfm.measurements.joint_map import KindOnMap, Located, find_kind, upward_by
@@ -28,6 +29,7 @@ from rangesfm.measurements.lengths.locate_lengths import (
     surveyed_distances,
 )
 from rangesfm.measurements.lengths.words import LENGTH_WORDS
+from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
@@ -138,18 +140,21 @@ class Kind:
         words: how people are told of it. locate: returns it in a map; None where it is not in it.
         read: returns what a survey has of it; None without any, or where ``read_ranging_inputs`` has read it already:
             ranges, positions and lengths share files and their frame.
+        planned: its table of a plan file; None without one, or where ``plan_file`` has it: a plan may change the number
+            and the places of anchors, control points and lengths.
     """
 
     words: KindWords
     locate: Callable[[RangingInputs, MapOfPhotos], Located | None]
     read: Callable[[Survey], KindAsRead | None] = lambda survey: None
+    planned: type[PlannedKind] | None = None
 
 
 KINDS = (
     Kind(RANGE_WORDS, _ranges),
     Kind(POSITION_WORDS, _positions),
     Kind(LENGTH_WORDS, _lengths),
-    Kind(IMU_WORDS, _inertial, lambda survey: read_sensor(survey.imu)),
+    Kind(IMU_WORDS, _inertial, lambda survey: read_sensor(survey.imu), PlannedSensor),
 )
 """All kinds of measurement. The first that is used decides what is doubtful."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -28,7 +28,8 @@ from rangesfm.measurements.imu.sensor_prior import (
     WALK,
     SensorPrior,
 )
-from rangesfm.option_model import Options
+from rangesfm.measurements.imu.words import IMU
+from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.solver.bending import MapBending
 from rangesfm.util.geometry.gravity import UP_IN_SITE
 
@@ -39,8 +40,10 @@ _RATE_HZ = 100.0
 _Noise = Annotated[float, Field(ge=1e-7, le=1.0)]
 
 
-class PlannedSensor(Options, table="imu"):
+class PlannedSensor(PlannedKind, table=IMU):
     """Planned inertial sensor on the camera: a gyroscope and an accelerometer."""
+
+    advice = "record the inertial sensor of a phone on the camera"
 
     grade: Literal["phone", "tactical"] = "phone"
     """Noise of the sensor: that of phones, action cameras and cheap rigs, or a tenth of it."""
@@ -48,6 +51,11 @@ class PlannedSensor(Options, table="imu"):
     """Noise density of the gyroscope, rad/s per root of Hz (default: by the grade)."""
     accel_noise: _Noise | None = None
     """Noise density of the accelerometer, m/s^2 per root of Hz (default: by the grade)."""
+
+    @classmethod
+    def like(cls, learnt: Mapping[str, Any]) -> PlannedSensor:
+        """Return a sensor with the noise of that of a result."""
+        return cls(gyro_noise=learnt["gyro_noise"], accel_noise=learnt["accel_noise"])
 
     @property
     def sizes(self) -> Mapping[str, float]:
