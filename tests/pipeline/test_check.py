@@ -89,6 +89,15 @@ def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_fa
     assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]
 
 
+def test_what_alone_determines_the_scale_is_told(folder: Path) -> None:
+    rows = [(PHONE_START_S + k, 2.0 * k, np.sin(k), 0.1 * k) for k in range(20)]
+    write_rows(folder / "gps.csv", "timestamp_s,x_m,y_m,z_m", rows)
+    given, said = {"positions__path": folder / "gps.csv"}, "positions: 20 in gps.csv (table)"
+    assert said in check_survey(survey_of(folder, **given)).facts
+    alone = check_survey(survey_of(folder, **given, ranges__path=None)).facts
+    assert f"{said}, which alone determine the scale (no ranges)" in alone
+
+
 def test_the_times_of_a_model_are_those_of_its_photos(folder: Path) -> None:
     at = np.arange(20.0)
     names = tuple(f"{k}.jpg" for k in range(20))

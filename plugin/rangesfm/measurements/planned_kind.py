@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from rangesfm.measurements.joint_map import KindOnMap
 from rangesfm.option_model import Options
@@ -21,11 +21,11 @@ class PlannedKind(Options):
     """What to do to have such measurements, as they usually are, where times of photos are known; empty: no advice."""
 
     @classmethod
-    def like(cls, learnt: Mapping[str, Any]) -> Self:
+    def like(cls, learnt: Mapping[str, float]) -> Self:
         """Return a plan of the same measurements as those of a result.
 
         Args:
-            learnt: what a run has learnt of them, by its name in ``result.json``, such as sizes of errors.
+            learnt: sizes of errors that a run has learnt, by their names in ``result.json``.
         """
         del learnt
         return cls()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,7 +50,10 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
     used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
-    others = _others({kind: entry.to_json() for kind, entry in folder.summary.of_kinds.items()})
+    entries = {kind: entry.to_json() for kind, entry in folder.summary.of_kinds.items()}
+    others = _others(
+        {kind: {k: v for k, v in entry.items() if isinstance(v, float)} for kind, entry in entries.items()}
+    )
     if model is None:
         raise InputError("has no metric model, expected a finished result", path)
     if not len(used) and not others:
@@ -110,7 +112,7 @@ def with_advice(metric: MetricResult, upward: Gravity | None) -> MetricResult:
     return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
 
 
-def _others(learnt: Mapping[str, Mapping[str, Any]]) -> dict[str, PlannedKind]:
+def _others(learnt: Mapping[str, Mapping[str, float]]) -> dict[str, PlannedKind]:
     """Return plans of the kinds of measurement that have a table of their own, given what was learnt of each kind."""
     planned = {kind.words.kind: kind.planned for kind in KINDS if kind.planned is not None}
     return {name: kind.like(learnt[name]) for name, kind in planned.items() if name in learnt}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -53,9 +53,9 @@ class PlannedSensor(PlannedKind, table=IMU):
     """Noise density of the accelerometer, m/s^2 per root of Hz (default: by the grade)."""
 
     @classmethod
-    def like(cls, learnt: Mapping[str, Any]) -> PlannedSensor:
+    def like(cls, learnt: Mapping[str, float]) -> PlannedSensor:
         """Return a sensor with the noise of that of a result."""
-        return cls(gyro_noise=learnt["gyro_noise"], accel_noise=learnt["accel_noise"])
+        return cls(gyro_noise=learnt.get("gyro_noise"), accel_noise=learnt.get("accel_noise"))
 
     @property
     def sizes(self) -> Mapping[str, float]:
