@@ -84,6 +84,15 @@ def test_nmea_gives_ellipsoidal_heights_utc_and_stddevs(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance_m2[0])), [0.03, 0.02, 0.05])
     assert found.covariance_m2[1, 0, 0] == pytest.approx(9.0)
     assert found.notes == ("positions.txt: 1 broken sentences are left out",)
+    by_host = "".join(f"2024-02-29T23:59:59.100Z {line}\n" for line in text.splitlines())
+    np.testing.assert_array_equal(read(tmp_path, by_host).position_m, found.position_m)
+
+
+def test_degrees_in_the_names_of_columns_tell_longitude_from_latitude(tmp_path: Path) -> None:
+    rows = "".join(f"2026/05/04 10:00:0{k}.000;{47 + k * 1e-6:.6f};9.0;430.0;1\n" for k in range(9))
+    found = read(tmp_path, f"GPST;latitude(deg);longitude(deg);height(m);Q\n{rows}")
+    assert found.crs == GEOGRAPHIC
+    np.testing.assert_allclose(found.position_m[1], [9, 47.000001, 430], rtol=1e-12)
 
 
 def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> None:

@@ -225,7 +225,12 @@ def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
 
 
 def _is_nmea(head: str) -> bool:
-    return any(_NMEA.fullmatch(line.strip()) for line in head.split("\n")[:50])
+    return any(map(_sentence, head.split("\n")[:50]))
+
+
+def _sentence(line: str) -> re.Match[str] | None:
+    """Return the sentence of NMEA in a line, which may have the host's time in front; None if there is none."""
+    return _NMEA.fullmatch(line[line.find("$") :].strip())
 
 
 def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
@@ -236,13 +241,13 @@ def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
     rows, lines, stddevs, num_broken = list[list[float]](), list[int](), list[Array](), 0
     day_s, last_s, errors = 0.0, -np.inf, dict[float, Array]()
     for line, text in enumerate(read_text(path, errors="replace").split("\n"), 1):
-        found = _NMEA.fullmatch(text.strip())
+        found = _sentence(text)
         if found is None:
             continue
         kind, body, checksum = found.groups()
         cells = body.split(",")
         try:
-            if checksum is not None and _checksum(text) != int(checksum, 16):
+            if checksum is not None and _checksum(found[0]) != int(checksum, 16):
                 raise ValueError
             if kind in ("RMC", "ZDA"):
                 day_s = _day_of_nmea(kind, cells)

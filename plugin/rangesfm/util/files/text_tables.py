@@ -316,14 +316,20 @@ def read_text(path: AnyPath, *, errors: str = "strict") -> str:
             line = data.count(b"\n", 0, error.start) + 1
             raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x}): save it as UTF-8", path, line) from None
         text = data.decode(_WINDOWS)
-    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    text = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    return _with_plain_minus(text)
+
+
+def _with_plain_minus(text: str) -> str:
+    """Return a text with minus signs of typesetting in front of digits as those that programs write."""
+    return re.sub("\u2212(?=[0-9.,])", "-", text) if "\u2212" in text else text
 
 
 def read_head(path: AnyPath) -> str:
     """Read the first part of a file like ``read_text``; bytes that are not text are replaced."""
     data = _read_bytes(path, _HEAD_BYTES)
     encoding = _WINDOWS if _is_windows_text(data) else _encoding(data)
-    return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    return _with_plain_minus(data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n"))
 
 
 def header_names(text: str, separator: str = FOUND) -> list[str]:

@@ -206,6 +206,12 @@ def test_lengths_are_in_their_own_unit_or_else_in_that_of_the_coordinates(
     assert anchor.range_bias_stddev_m == pytest.approx(6 / (100 if "cm" in f"{header} {unit}" else 1))
 
 
+def test_words_for_nothing_and_the_minus_of_typesetting_are_read_in_the_usual_table_too(tmp_path: Path) -> None:
+    first, second = read_anchors(table(tmp_path, "anchor_id,x_m,y_m,z_m/A,NaN,nan,-/B,\u22121.5,2,\u2212.5"))
+    assert first.position_m is None
+    np.testing.assert_array_equal(known(second.position_m), [-1.5, 2, -0.5])
+
+
 def test_the_unit_of_each_coordinate_is_told(tmp_path: Path) -> None:
     found = read_anchor_list(table(tmp_path, "Point,X [mm],Y [cm],Z [m]/A,1000,200,3"))
     np.testing.assert_allclose(known(found[0][0].position_m), [1, 2, 3])

@@ -19,7 +19,7 @@ from rangesfm.errors import InputError, printable
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import described
-from rangesfm.measurements.ranges.readers.layout import SHORTEST_M, ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.layout import MISSING, SHORTEST_M, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError, columns_typed
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.option_model import Bounds
@@ -130,7 +130,8 @@ class TableForm:
         found = {self.aliases.get(name, name) for name in header_names(read_head(path), separator)}
         way = next((way for way in self._ways if {*way} <= found), self._ways[0])
         optional = [name for name in self.names.values() if name not in way]
-        return read_table(path, way, optional, aliases=self.aliases, separator=separator).by_quantity(self.names)
+        table = read_table(path, way, optional, aliases=self.aliases, separator=separator).by_quantity(self.names)
+        return replace(table, missing=MISSING)
 
     def read(
         self, path: Path, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None, *, every_row: bool = True

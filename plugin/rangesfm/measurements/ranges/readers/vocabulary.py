@@ -136,7 +136,7 @@ DEGREES = {
 }
 BESIDE_COORDINATE = LENGTH_UNIT | _words(
     "coord coords coordinate coordinates koordinate coordonnée coordenada coordinata coördinaat pos position value "
-    "wert local gps gnss rtk"
+    "wert local gps gnss rtk deg degree degrees grad"
 )
 # Words in the names of further coordinates of a point: estimated ones, and those of the base station.
 ESTIMATED = _words("est estimated")
