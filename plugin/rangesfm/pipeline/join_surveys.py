@@ -259,8 +259,8 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     """
     journal = Journal(progress)
     check_formats(survey.export.formats)
-    finished = read_finished_runs(folders)
     require_apart(folders, survey.output.path)
+    finished = read_finished_runs(folders)
     log, number, is_check = joined_log(finished, survey.anchors.use)
     anchors, frame = _anchors(survey, finished, log)
     crs = survey.anchors.crs or _common(one.result.summary.settings.anchors.crs for one in finished) or ""
