@@ -529,6 +529,10 @@ def make_template(folder: Path) -> None:
         if done.returncode:
             raise SystemExit(done.stderr)
     shutil.copytree(survey / "out", survey / "out_2")
+    header, *ranges = (survey / "out_2" / "ranges.csv").read_text().splitlines()
+    assert header.startswith("timestamp_s,")
+    later = [f"{float(time) + 1e4},{rest}" for time, _, rest in (row.partition(",") for row in ranges)]
+    (survey / "out_2" / "ranges.csv").write_text("\n".join([header, *later]) + "\n")  # a copy is not joined
     shutil.copytree(survey / "images", survey / "project" / "images")
     shutil.copytree(survey / "out" / "sparse", survey / "project" / "sparse")
     shutil.copyfile(survey / "out" / "database.db", survey / "project" / "database.db")
