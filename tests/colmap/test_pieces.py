@@ -9,7 +9,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import sequence_path
 from tests.simulated.pieces import leave_across, points_across
 
-from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_largest_part, loose_pieces, overlaps_in, seen_in
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_parts, loose_pieces, overlaps_in, seen_in
 
 NUM_PHOTOS = 30
 SECOND = tuple(f"frame_{k:05d}.jpg" for k in range(19, NUM_PHOTOS + 1))
@@ -63,17 +63,26 @@ def test_a_photo_that_shares_few_points_is_no_piece_and_hangs_loose(
     leave_across(model, SECOND[-1:], num_points)
     assert loose_pieces(model) == ()
     is_held = num_points == MIN_NUM_SHARED
-    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + is_held))
+    largest, *others = frames_of_parts(model)
+    np.testing.assert_array_equal(largest, np.arange(1, NUM_PHOTOS + is_held))
+    assert [each.tolist() for each in others] == ([] if is_held else [[NUM_PHOTOS]])
 
 
-def test_the_largest_part_of_a_map_of_few_points_is_the_whole_map(model: pycolmap.Reconstruction) -> None:
-    half = [image.name for image in model.images.values() if image.image_id > NUM_PHOTOS / 2]
-    leave_across(model, half, 0)
-    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + 1))
+def test_parts_come_in_the_order_of_their_sizes(model: pycolmap.Reconstruction) -> None:
+    first, second = frames_of_parts(with_neck(model, 4))
+    assert (len(first), len(second)) == (NUM_PHOTOS - len(SECOND), len(SECOND))
+
+
+def test_photos_alone_belong_to_the_largest_part_of_a_map_of_few_points(model: pycolmap.Reconstruction) -> None:
+    for point_id in [i for i, p in model.points3D.items() if p.track.elements[0].image_id > NUM_PHOTOS / 3]:
+        model.delete_point3D(point_id)
+    (whole,) = frames_of_parts(model)
+    np.testing.assert_array_equal(whole, np.arange(1, NUM_PHOTOS + 1))
     for point_id in list(model.points3D):
         model.delete_point3D(point_id)
-    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + 1))
-    assert len(frames_of_largest_part(pycolmap.Reconstruction())) == 0
+    (whole,) = frames_of_parts(model)
+    np.testing.assert_array_equal(whole, np.arange(1, NUM_PHOTOS + 1))
+    assert frames_of_parts(pycolmap.Reconstruction()) == ()
 
 
 def test_photos_overlap_by_the_points_they_have_in_common(model: pycolmap.Reconstruction) -> None:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.estimation.test_photo_bending import NUM, bending_of, simulated
+from tests.estimation.test_photo_bending import NUM, NUM_OF_FIRST, bending_of, of_two_parts, simulated
 from tests.simulated.model import random_similarity
 
 from rangesfm.colmap.transform import rescale
-from rangesfm.estimation.map_posterior import _turns_bounded, errors_at_estimate
+from rangesfm.estimation.map_posterior import _turns_bounded, errors_at_estimate, firm_poses, sizes_of_parts
 from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.solver.linear_map import Columns
@@ -79,3 +79,53 @@ def test_parts_of_a_map_err_as_functions_of_it_that_were_not_observed(frame_is_f
     of_anchor = covariance[-3:, -3:]
     np.testing.assert_allclose(errors.covariances("anchor")[0], of_anchor, rtol=1e-4)
     assert errors.scale_stddev == pytest.approx(covariance[0, 0] ** 0.5, rel=1e-4)
+
+
+def measured_at_centers(size: float, num_seen: int) -> JointMap:
+    """Return a map of two parts, the second of which is too large, with positions of its first photos to 1 cm."""
+    bending = bending_of(of_two_parts())
+    assert isinstance(bending, PhotoBending)
+    path, rng = bending.path, np.random.default_rng(6)
+    is_second = bending.parts[1]
+    middle = path.centers[is_second].mean(axis=0)
+    off_m = np.where(is_second[:, None], size * (path.centers - middle), 0.0) + 0.01 * rng.normal(size=(NUM, 3))
+    by_center = np.zeros((NUM, 3, NUM, 6))
+    by_center[np.arange(NUM), :, np.arange(NUM), 3:] = np.eye(3)
+    nothing = np.zeros(0, dtype=np.int64)
+    num = 3 * num_seen
+    seen = Observations(
+        Columns(0, 1, nothing, nothing, 7),
+        similarity_motions(path.centers - path.centers[0]).reshape(-1, 7)[:num],
+        off_m.ravel()[:num],
+        kind="centers",
+        by_pose=by_center.reshape(3 * NUM, -1)[:num],
+        components=(Component("white", np.eye(num), 0.01, 0.5),),
+        alone_m2=1e-4 * np.eye(num),
+        is_used=np.ones(num, dtype=bool),
+    )
+    problem = joined([seen], bending).learnt()
+    return JointMap((), IDENTITY, bending, False, {"centers": seen}, problem, problem.posterior())
+
+
+def test_measurements_tell_the_size_of_a_part_that_no_point_ties_to_the_rest() -> None:
+    on_map = measured_at_centers(0.1, NUM)
+    (size,) = sizes_of_parts(on_map)
+    assert size.is_determined
+    assert size.off == pytest.approx(0.1, abs=3 * size.stddev)
+    assert 0.0005 < size.stddev < 0.02
+    # That the photos leave it open says nothing of how a map bends.
+    assert 0.3 < on_map.problem.bending_factor < 5
+    poses = firm_poses(on_map)
+    assert poses is not None
+    assert poses.all()
+
+
+def test_a_part_that_neither_photos_nor_measurements_tie_to_the_rest_is_no_part_of_the_maps_size() -> None:
+    on_map = measured_at_centers(0.1, NUM_OF_FIRST)
+    (size,) = sizes_of_parts(on_map)
+    assert not size.is_determined
+    assert size.stddev == pytest.approx(1.0, rel=0.1)
+    poses = firm_poses(on_map)
+    assert poses is not None
+    assert np.flatnonzero(poses).tolist() == list(range(NUM_OF_FIRST))
+    assert on_map.posterior.uncertainty.empirical < 0.02

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from tests.simulated.model import SyntheticModel, random_similarity, synthetic_model
 from tests.simulated.path import loop_path
+from tests.simulated.pieces import leave_across
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
@@ -16,7 +17,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
-NUM = 16
+NUM, NUM_OF_FIRST = 16, 9
 
 
 def simulated(pixel_stddev: float) -> SyntheticModel:
@@ -83,6 +84,41 @@ def test_twice_the_noise_bends_twice_as_far() -> None:
     by_pose = along_x(once.path)
     stddevs = [np.sqrt(np.diag(each.of_functions(by_pose, frame_is_free=True).formal_m2)) for each in (once, twice)]
     assert np.median(stddevs[1] / stddevs[0]) == pytest.approx(2.0, rel=0.2)
+
+
+def of_two_parts(pixel_stddev: float = 1.0) -> pycolmap.Reconstruction:
+    """Return a map whose last photos see nothing of what the first ones see."""
+    model = simulated(pixel_stddev).reconstruction
+    leave_across(model, {image.name for image in model.images.values() if image.image_id > NUM_OF_FIRST}, 0)
+    return model
+
+
+def test_what_a_part_may_do_that_no_point_ties_to_the_rest_is_known_and_is_no_bending() -> None:
+    whole, cut = bending_of(simulated(1.0).reconstruction), bending_of(of_two_parts())
+    assert isinstance(whole, PhotoBending)
+    assert isinstance(cut, PhotoBending)
+    assert whole.loose.steps.shape[1] == 0
+    assert cut.loose.steps.shape[1] == 7
+    (bends, loose), by_pose = cut.of_functions(along_x(cut.path), frame_is_free=True).parts, along_x(cut.path)
+    assert (bends.name, loose.name, loose.spread) == ("bending", "loose_parts", 0.0)
+    of_first, of_second = np.split(np.sqrt(np.diag(loose.usual**2 * loose.alike)), [NUM_OF_FIRST])
+    extent = np.linalg.norm(np.ptp(cut.path.centers, axis=0))
+    assert of_first.max() < 0.01 * extent
+    assert 0.5 * extent < of_second.min()
+    formal = [np.sqrt(np.diag(each.of_functions(by_pose, frame_is_free=True).formal_m2)) for each in (whole, cut)]
+    assert formal[1].max() < 5 * formal[0].max()
+
+
+def test_a_photo_that_one_point_ties_to_the_rest_may_be_anywhere() -> None:
+    model = simulated(1.0).reconstruction
+    leave_across(model, {max(image.name for image in model.images.values())}, 1)
+    bending = bending_of(model)
+    assert isinstance(bending, PhotoBending)
+    assert 3 <= bending.loose.steps.shape[1] <= 6  # it has no size
+    loose = bending.of_functions(along_x(bending.path), frame_is_free=True).parts[1]
+    stddev = np.sqrt(np.diag(loose.alike))
+    assert loose.name == "loose_parts"
+    assert stddev[:-1].max() < 0.01 * stddev[-1]
 
 
 def test_a_path_without_points_walks() -> None:

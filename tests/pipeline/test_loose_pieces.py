@@ -9,33 +9,71 @@ import json
 import re
 from typing import Any
 
+import numpy as np
 import pycolmap
 import pytest
 from tests.conftest import Command, WalkedSurvey
 from tests.simulated.pieces import leave_across
 
+# A photo beside the gap may belong to either piece, or to none.
+OF_PIECES = re.compile(
+    r"the photos do not hold the map together: 1\d of its 40 photos \(frame_0002\d.jpg to frame_00040.jpg\) share "
+    r"only \d points with the others, so that the two parts may differ in scale and place"
+    r"(; beside the others, it is too large by (?P<percent>[-\d.]+) %)?"
+)
 
-@pytest.mark.parametrize(("num_across", "is_held"), [(5, False), (8, True)])
-def test_a_model_of_two_pieces_is_named_as_such_if_their_few_points_leave_the_scale_open(
-    own_survey: WalkedSurvey, rangesfm_command: Command, num_across: int, is_held: bool
+
+def test_ranges_tell_that_a_piece_is_too_large_which_the_photos_do_not_hold(
+    own_survey: WalkedSurvey, rangesfm_command: Command
 ) -> None:
-    folder = own_survey.folder / "sparse" / "0"
-    model = pycolmap.Reconstruction(folder)
-    names = sorted(image.name for image in model.images.values())
-    second = set(names[25:])
-    leave_across(model, second, num_across)
-    model.write(folder)
+    found = []
+    for size in (1.0, 1.1):
+        of_two_pieces(own_survey, size=size, num_across=0)
+        flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", f"out_{size}")
+        rangesfm_command("scale", *flags, cwd=own_survey.folder)
+        result = json.loads((own_survey.folder / f"out_{size}" / "result.json").read_text(encoding="utf-8"))
+        found.append(result["scale"])
+    assert found[0]["verdict"] == "good"
+    assert found[1]["verdict"] == "doubtful"
+    named = [OF_PIECES.match(reason) for reason in found[1]["reasons"]]
+    (too_large,) = [float(match["percent"]) for match in named if match and match["percent"]]
+    assert too_large == pytest.approx(100 * np.log(1.1), abs=2)
+
+
+def test_a_piece_that_neither_photos_nor_ranges_hold_may_have_any_size(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    of_two_pieces(own_survey, size=1.0, num_across=0)
+    log = own_survey.folder / "uwb.csv"
+    header, *rows = log.read_text(encoding="utf-8").splitlines()
+    first_s = float(rows[0].split(",")[0])
+    of_first = [row for row in rows if float(row.split(",")[0]) < first_s + 22]
+    log.write_text("\n".join([header, *of_first]) + "\n", encoding="utf-8")
     flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
     said = rangesfm_command("scale", *flags, cwd=own_survey.folder)
-    # A photo beside the gap may belong to either piece, or to none.
-    expected = re.compile(
-        r"the photos do not hold the map together: 1\d of its 40 photos \(frame_0002\d.jpg to frame_00040.jpg\) share "
-        r"only \d points with the others"
-    )
-    assert bool(expected.search(said.stderr)) != is_held
-    scale = json.loads((own_survey.folder / "out" / "result.json").read_text(encoding="utf-8"))["scale"]
-    assert scale["verdict"] == ("good" if is_held else "doubtful")
-    assert is_held or any(expected.match(reason) for reason in scale["reasons"])
+    match = OF_PIECES.search(said.stderr)
+    assert match
+    assert match["percent"] is None
+
+
+def of_two_pieces(survey: WalkedSurvey, *, size: float, num_across: int) -> None:
+    """Leave few points between the first photos and the others, and make what these see larger."""
+    folder = survey.folder / "sparse" / "0"
+    model = pycolmap.Reconstruction(folder)
+    second = set(survey.image_names[25:])
+    leave_across(model, second, num_across)
+    ids = sorted(image.image_id for image in model.images.values() if image.name in second)
+    origin = model.image(ids[0]).projection_center()
+    for image_id in ids:
+        image = model.image(image_id)
+        rotation = image.cam_from_world().rotation
+        center = origin + size * (image.projection_center() - origin)
+        pose = pycolmap.Rigid3d(rotation, -rotation.matrix() @ center)
+        model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    for point in model.points3D.values():
+        if all(element.image_id in ids for element in point.track.elements):
+            point.xyz = origin + size * (point.xyz - origin)
+    model.write(folder)
 
 
 @pytest.mark.parametrize("anchors", [("--anchors", "anchors.csv"), ()])

@@ -208,8 +208,8 @@ class Known:
         photos = PhotosAlone(
             NormalEquations.of(photos_problem, truth.reconstruction, photos_problem.num_residuals()), pixel_stddev
         )
-        is_firm = np.ones(len(path), dtype=bool)
-        bending = PhotoBending(photos, path, is_firm, True)
+        all_poses = np.ones(len(path), dtype=bool)
+        bending = PhotoBending(photos, path, (all_poses,), all_poses, True)
         found = scale_by_positions(PositionScale.begun(known, bending))
         problem = found.alone.problem
         parts = {part.name: part.alike for part in problem.components}

@@ -68,15 +68,18 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
     )
 
 
-def frames_of_largest_part(model: pycolmap.Reconstruction) -> Indices:
-    """Return the ids of the frames that share enough points to be one part, without those that hang loose on it.
+def frames_of_parts(model: pycolmap.Reconstruction) -> tuple[Indices, ...]:
+    """Return the ids of the frames of each part, the largest first.
 
-    They are all frames where the largest part has no more than half of them: then the map is one of few points.
+    Frames that hang loose alone are parts of one frame. In a map of few points, of which the largest part has no more
+    than half of all frames, they belong to it.
     """
     frame_ids, _, labels = _parts(model)
     num_frames = np.bincount(labels, minlength=1)
-    is_most = 2 * num_frames.max() > len(frame_ids)
-    return frame_ids[labels == num_frames.argmax()] if is_most else frame_ids
+    if 2 * num_frames.max() <= len(frame_ids):
+        labels = np.where(num_frames[labels] == 1, num_frames.argmax(), labels)
+    parts = (frame_ids[labels == part] for part in np.unique(labels))
+    return tuple(sorted(parts, key=len, reverse=True))
 
 
 def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]:

@@ -15,11 +15,14 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.diagnostics.place import Place, by_similarity, place_in_words
+from rangesfm.errors import number_text
+from rangesfm.estimation.map_posterior import sizes_of_parts
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RangesInMap, RefineSummary
+from rangesfm.measurements.joint_map import JointMap
 from rangesfm.measurements.kind import Doubt
 from rangesfm.util.geometry.map_errors import MapErrors
-from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -50,21 +53,32 @@ def doubts_of_refinement(summary: RefineSummary) -> Iterator[Doubt]:
         yield Doubt(f"after the refinement {misfit.reason}", misfit.advice)
 
 
-def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Doubt, ...]:
-    """Return a doubt for each part of a model that the photos hardly tie to the rest."""
+def doubts_of_pieces(pieces: Sequence[LoosePiece], on_map: JointMap, num_images: int) -> Iterator[Doubt]:
+    """Yield a doubt for each part of a model whose size beside the rest is not as photos and measurements tell it.
+
+    Args:
+        pieces: the parts that share few points with the rest. on_map: all that is measured in the map.
+    """
     advice = (
         "match more pairs of photos across that gap ([mapper] matching, [mapper.pairing]) and reconstruct again, or "
         "survey the parts apart and join them by their ranges (rangesfm join)"
     )
-    return tuple(
-        Doubt(
+    sizes = sizes_of_parts(on_map)
+    for piece in pieces:
+        is_part = np.isin(on_map.bending.path.image_names, piece.image_names)
+        size = next((each for each in sizes if np.array_equal(each.part, is_part)), None)
+        if size is not None and size.half_width_95 < DOUBTFUL_ABOVE:
+            continue
+        known = "so that the two parts may differ in scale and place"
+        if size is not None and size.is_determined:
+            off = f"it is too large by {number_text(100 * size.off, '.1f')} %" if size.off else "its size is known"
+            known += f"; beside the others, {off}, +- {100 * NORMAL_95 * size.stddev:.1f} % (95 %)"
+        yield Doubt(
             f"the photos do not hold the map together: {len(piece.image_names)} of its {num_images} photos "
             f"({piece.image_names[0]} to {piece.image_names[-1]}) share only {piece.num_shared} points with the "
-            "others, so that the two parts may differ in scale and place",
+            f"others, {known}",
             advice,
         )
-        for piece in pieces
-    )
 
 
 def place_of_map(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from rangesfm.arrays import Array
-from rangesfm.estimation.photo_bending import LARGEST_FACTOR, PhotoBending
+from rangesfm.arrays import Array, Mask
+from rangesfm.estimation.photo_bending import HELD, LARGEST_FACTOR, PhotoBending
 from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.solver.bending import NO_STEPS, FrameSteps
@@ -17,6 +18,7 @@ from rangesfm.solver.normal_equations import HALF_A_REVOLUTION
 from rangesfm.solver.part_errors import PartSteps, map_errors, rows_of, steps_of
 from rangesfm.solver.posterior import JointProblem
 from rangesfm.util.geometry.map_errors import UNKNOWN_ERRORS, MapErrors
+from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -42,6 +44,67 @@ def likely_bend(at_rest: JointMap, unscaled: Trajectory) -> FrameSteps:
     return steps._replace(shifts_m=size * (from_first_m + steps.shifts_m) - from_first_m)
 
 
+@dataclass(frozen=True)
+class SizeOfPart:
+    """The size of a part of a map beside its largest part, by photos and all that is measured.
+
+    Attributes:
+        part: (k,) mask of its poses among those of the path.
+        off: logarithm of its size in the map over that which it has. stddev: of that.
+    """
+
+    part: Mask
+    off: float
+    stddev: float
+
+    @property
+    def is_determined(self) -> bool:
+        return self.stddev < HELD
+
+    @property
+    def half_width_95(self) -> float:
+        """By how much the part may be too large or too small beside the others, with 95 % probability."""
+        return abs(self.off) + NORMAL_95 * self.stddev
+
+
+def sizes_of_parts(on_map: JointMap) -> tuple[SizeOfPart, ...]:
+    """Return the sizes of the parts of a map that share few points with the others (section 7 of ``model.md``).
+
+    None of a map whose photos do not say how it is bent.
+    """
+    bending, problem, known = on_map.bending, on_map.problem, on_map.posterior
+    if not isinstance(bending, PhotoBending):
+        return ()
+    parts = [part for part in bending.parts[1:] if np.count_nonzero(part) > 1]
+    if not parts:
+        return ()
+    linear, noise = problem.among(problem.is_used)
+    by_pose = np.vstack([*map(bending.size_beside, parts), on_map.by_pose])
+    gradients = bending.shape_by_steps(by_pose, frame_is_free=known.columns.frame >= 0)
+    factor = _factor(problem)
+    own, observed = gradients[:, : len(parts)], gradients[:, len(parts) :]
+    moved = factor**2 * bending.photos_at(factor).solve(own)
+    across = moved.T @ observed
+    whitened = np.linalg.solve(regular(noise.covariance_m2), np.hstack([across.T, linear.design]))
+    left = across @ whitened[:, len(parts) :]
+    covariance = moved.T @ own - across @ whitened[:, : len(parts)] + left @ known.covariance @ left.T
+    # A refined map is where all that is measured has it; a scaled one is as the photos alone have it.
+    off = np.zeros(len(parts)) if on_map.is_at_rest else -across @ known.pulls
+    stddevs = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return tuple(map(SizeOfPart, parts, off.tolist(), stddevs.tolist()))
+
+
+def firm_poses(on_map: JointMap) -> Mask | None:
+    """Return a (k,) mask of the poses of all parts whose sizes photos and measurements tell; None if photos tell none.
+
+    They are the map: its size and its place are theirs.
+    """
+    if not isinstance(on_map.bending, PhotoBending):
+        return None
+    told = (each.part for each in sizes_of_parts(on_map) if each.is_determined)
+    return np.asarray(np.any([on_map.bending.parts[0], *told], axis=0))
+
+
 def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[str]) -> MapErrors:
     """Return how the parts of a map err that was bent and moved to its best estimate (section 7 of ``model.md``).
 
@@ -60,7 +123,7 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     problem, known, bending = at_rest.problem, at_rest.posterior, at_rest.bending
     if not isinstance(bending, PhotoBending):
         return UNKNOWN_ERRORS
-    columns, photos, variance = known.columns, bending.photos, _factor(problem) ** 2
+    columns, photos, variance = known.columns, bending.photos_at(_factor(problem)), _factor(problem) ** 2
     linear, noise = problem.among(problem.is_used)
     column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))
     heard = [name for what, name in rest.blocks if what == "anchor" and name in column_of]

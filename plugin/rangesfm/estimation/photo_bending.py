@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array, Mask
-from rangesfm.colmap.pieces import frames_of_largest_part
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.colmap.pieces import frames_of_parts
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.vision_information import misplaced_points, model_rays
 from rangesfm.options import CameraOptions, RefineOptions
@@ -25,9 +26,10 @@ from rangesfm.solver.bending import (
 )
 from rangesfm.solver.bundle_adjustment import bundle_adjustment
 from rangesfm.solver.covariance import PhotosAlone
-from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.solver.normal_equations import HALF_A_REVOLUTION, NormalEquations
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.similarity import similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
@@ -36,9 +38,49 @@ from rangesfm.util.geometry.trajectory import Trajectory
 MEDIAN_FACTOR, _SPREAD = 2.0, 0.8
 LARGEST_FACTOR = MEDIAN_FACTOR * float(np.exp(NORMAL_95 * _SPREAD))
 """Largest such factor of a map whose lens fits."""
-# Standard deviation of the scale of one part of a map relative to another from which the photos do not hold them
-# together: parts of a map that share six points are held to 0.01, those that share five may have any scale.
-_HELD = 0.1
+# Share of what a part of a map may be off by in size, turn and place from which it is tied but loosely to the rest: the
+# sizes of parts that share six points are tied to 0.01 of themselves, those that share five may have any size.
+HELD = 0.1
+
+
+@dataclass(frozen=True)
+class LooseParts:
+    """Motions of parts of a map that its photos hardly tie to the rest: m directions, each with an error of its own.
+
+    What photos say of them is next to nothing, so that its size is not that of the map's bending. Before anything is
+    measured, a part has any turn, is anywhere within the extent of the map, and its size is right to a factor of e.
+
+    Attributes:
+        steps: (n, m) steps of the photos by each motion.
+        by_photos, variances: (m,) variances as the photos have them, for a bending as they expect it, and with all that
+            is known of a part.
+    """
+
+    steps: Array
+    by_photos: Array
+    variances: Array
+
+    @classmethod
+    def of(cls, photos: PhotosAlone, by_steps: Array, extent: float) -> LooseParts:
+        """Return the loose ones of the motions of parts.
+
+        Args:
+            by_steps: (n, 7 p) derivatives of the motions of p parts relative to the rest by the photos' steps: of the
+                logarithm of the size, a turn, and a shift in the path's unit. extent: of the path.
+        """
+        usual = np.tile([1.0, *[HALF_A_REVOLUTION] * 3, *[extent] * 3], by_steps.shape[1] // 7)
+        by_steps = by_steps / usual
+        moved = photos.solve(by_steps)
+        by_photos, directions = np.linalg.eigh(by_steps.T @ moved)
+        # Errors of real features are some times what their residuals suggest.
+        variance = (MEDIAN_FACTOR * np.exp(_SPREAD**2)) ** 2 * by_photos
+        loose = variance > HELD**2
+        variance, by_photos = variance[loose], by_photos[loose]
+        return cls(moved @ directions[:, loose] / by_photos, by_photos, variance / (1 + variance))
+
+    def replaced_in(self, photos: PhotosAlone, factor: float) -> PhotosAlone:
+        """Return what photos say of the steps with what is known of these parts, over the square of the bending."""
+        return photos.with_more(self.steps, self.variances / factor**2 - self.by_photos)
 
 
 @dataclass(frozen=True)
@@ -47,20 +89,42 @@ class PhotoBending:
 
     Attributes:
         photos: linearised at the map as it is. path: of the map, in its world.
-        is_firm: (k,) True for the poses of the path that the photos hold together; the map's size and place are theirs.
+        parts: (k,) masks of the poses of parts that share few points with others, the largest first.
+        is_firm: (k,) True for the poses of the path whose size and place are the map's.
         is_at_optimum: whether the map is at the photos' own minimum.
     """
 
     photos: PhotosAlone
     path: Trajectory
+    parts: tuple[Mask, ...]
     is_firm: Mask
     is_at_optimum: bool
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         gradients = self.shape_by_steps(by_pose, frame_is_free=frame_is_free)
-        covariance = gradients.T @ self.photos.solve(gradients)
-        shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else gradients.T @ self.photos.at_minimum
-        return Bending(bending_parts("bending", covariance, MEDIAN_FACTOR, _SPREAD), covariance, shift_m)
+        of_loose = gradients.T @ self.loose.steps
+        covariance = gradients.T @ self.photos.solve(gradients) - of_loose * self.loose.by_photos @ of_loose.T
+        parts = bending_parts("bending", covariance, MEDIAN_FACTOR, _SPREAD)
+        parts += bending_parts("loose_parts", of_loose * self.loose.variances @ of_loose.T, 1.0, 0.0)
+        shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else gradients.T @ self.at_minimum
+        return Bending(parts, covariance, shift_m)
+
+    @cached_property
+    def loose(self) -> LooseParts:
+        """Motions of parts that the photos hardly tie to the rest."""
+        motions = (_motion_beside(self.path, part, self.parts[0]) for part in self.parts[1:])
+        by_pose = np.vstack([np.zeros((0, 6 * len(self.path))), *motions])
+        extent = float(np.linalg.norm(np.ptp(self.path.centers, axis=0)))
+        return LooseParts.of(self.photos, self._by_steps(by_pose), extent)
+
+    def size_beside(self, part: Mask) -> Array:
+        """Return the (1, 6 k) derivatives by the poses of the logarithm of a part's size relative to the largest."""
+        return _motion_beside(self.path, part, self.parts[0])[:1]
+
+    @cached_property
+    def at_minimum(self) -> Array:
+        """(n,) steps to where the photos alone have the map, with what is known of loose parts before."""
+        return self.loose.replaced_in(self.photos, MEDIAN_FACTOR * float(np.exp(_SPREAD**2))).at_minimum
 
     def likely_steps(self, pull: Array, factor: float, *, frame_is_free: bool) -> FrameSteps:
         """Return the steps to where the map is likeliest bent, without a change of its size and its place as a whole.
@@ -71,11 +135,15 @@ class PhotoBending:
             factor: learnt bending over that expected from the photos. frame_is_free: as in ``of_functions``.
         """
         gradient = self.shape_by_steps(pull[None], frame_is_free=frame_is_free)
-        steps = factor**2 * self.photos.solve(gradient)[:, 0] + self.photos.at_minimum
+        steps = factor**2 * self.photos_at(factor).solve(gradient)[:, 0] + self.at_minimum
         frame_ids, poses = self.photos.poses
         whole = self.similarity_by_steps(frame_is_free=frame_is_free).T @ steps
         of_frames = self.photos.of_frames(steps) - motions_of_poses(poses.world_from_rig, self.from_first_m) @ whole
         return FrameSteps(frame_ids, of_frames[:, :3], of_frames[:, 3:])
+
+    def photos_at(self, factor: float) -> PhotosAlone:
+        """Return what photos, and what is known of loose parts, say of the steps, over the square of the bending."""
+        return self.loose.replaced_in(self.photos, factor)
 
     def shape_by_steps(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         """Return the derivatives (n, c) by the photos' steps of functions without those by scale and place."""
@@ -86,7 +154,7 @@ class PhotoBending:
         return self._by_steps(similarity_of(self.path, self.is_firm, frame_is_free=frame_is_free))
 
     def _by_steps(self, by_pose: Array) -> Array:
-        parts = by_pose.reshape(len(by_pose), -1, 6)
+        parts = by_pose.reshape(len(by_pose), len(self.path), 6)
         return self.photos.by_steps(self.path.frame_ids, parts[:, :, :3], parts[:, :, 3:])
 
     @property
@@ -94,20 +162,6 @@ class PhotoBending:
         """(m, 3) centres of the photos' frames, from that of the first pose of the path."""
         frame_ids, poses = self.photos.poses
         return np.asarray(poses.centers - poses.centers[np.searchsorted(frame_ids, self.path.frame_ids[0])])
-
-    def hold_together(self, image_names: Collection[str]) -> bool:
-        """Return whether the photos determine the scale of a part of the map relative to the rest.
-
-        Args:
-            image_names: photos of the part, of which the path has two or more, and two or more of the rest.
-        """
-        is_part = np.isin(self.path.image_names, list(image_names))
-        by_pose = np.zeros((len(self.path), 6))
-        for part, sign in ((is_part, 1.0), (~is_part, -1.0)):  # derivatives of the logarithms of both sizes
-            off = self.path.centers[part] - self.path.centers[part].mean(axis=0)
-            by_pose[part, 3:] = sign * off / np.sum(off**2)
-        covariance = self.of_functions(by_pose.reshape(1, -1), frame_is_free=True).formal_m2
-        return bool(covariance[0, 0] < _HELD**2)
 
 
 def bending_of_model(
@@ -129,8 +183,30 @@ def bending_of_model(
         bundle = bundle_adjustment(model, camera, options, num_threads=num_threads, left_out_ids=misplaced.tolist())
         if bundle.has_covariance:
             equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
-            is_firm = np.isin(trajectory.frame_ids, frames_of_largest_part(model))
-            return PhotoBending(PhotosAlone(equations, bundle.pixel_stddev), trajectory, is_firm, is_at_optimum=True)
+            parts = parts_of_path(trajectory, frames_of_parts(model))
+            photos = PhotosAlone(equations, bundle.pixel_stddev)
+            return PhotoBending(photos, trajectory, parts, parts[0], is_at_optimum=True)
     except (SolverError, GeometryError, InputError):
         pass
     return WalkBending(trajectory)
+
+
+def parts_of_path(path: Trajectory, parts: Sequence[Indices]) -> tuple[Mask, ...]:
+    """Return (k,) masks of the poses of each part that has any, by the ids of its frames."""
+    masks = (np.isin(path.frame_ids, part) for part in parts)
+    return tuple(mask for mask in masks if mask.any())
+
+
+def _motion_beside(path: Trajectory, part: Mask, rest: Mask) -> Array:
+    """Return the (7, 6 k) derivatives by the poses of how a part of a path moves relative to the rest.
+
+    They are those of the logarithm of its size, its turn, and its shift about its middle. One pose has no size.
+    """
+    middle = similarity_motions((path.centers[part].mean(axis=0) - path.centers[0])[None])[0]
+    of_rest = similarity_of(path, rest, frame_is_free=True)
+    if np.count_nonzero(part) > 1:
+        of_part = similarity_of(path, part, frame_is_free=True) - of_rest
+        return np.vstack([of_part[:4], middle @ of_part])
+    own = np.zeros((7, len(path), 6))
+    own[1:4, part, :3], own[4:, part, 3:] = path.world_from_cam[part].swapaxes(0, 1), np.eye(3)[:, None]
+    return np.asarray(own.reshape(7, -1) - np.vstack([0 * of_rest[:1], of_rest[1:4], middle @ of_rest]))

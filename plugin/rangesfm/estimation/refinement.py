@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.colmap.pieces import frames_of_largest_part
+from rangesfm.colmap.pieces import frames_of_parts
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.drift import SAME_NOISE, close_in_graph, straighten, straighten_again
 from rangesfm.estimation.free_fit import GraphSolution
@@ -53,7 +53,7 @@ class MapAtRest:
         state: of the map. blocks: its parameter blocks, to which the equations refer.
         equations: of photos and all measurements; None if the photos are too many, or if they were not asked for.
         refined_params: which parameters of each camera are adjusted, by its id.
-        firm_ids: of the frames that the photos hold together, which are the map as a whole.
+        parts: ids of the frames of each part, as of ``frames_of_parts``.
         run: of the solver; its ``pixel_stddev`` is the unit of the equations. pixel_stddev_at_rest: the same after it.
         bend_m, num_graph_steps: of the keyframe graph before.
     """
@@ -63,7 +63,7 @@ class MapAtRest:
     blocks: Mapping[Block, Array]
     equations: NormalEquations | None
     refined_params: dict[int, list[int]]
-    firm_ids: Indices
+    parts: tuple[Indices, ...]
     run: SolverRun
     pixel_stddev_at_rest: float
     bend_m: float
@@ -173,7 +173,7 @@ def _adjusted(
         blocks=added,
         equations=equations_of(adjustment, added) if with_equations and adjustment.has_covariance else None,
         refined_params=adjustment.refined_params,
-        firm_ids=frames_of_largest_part(problem.metric),
+        parts=frames_of_parts(problem.metric),
         run=run,
         pixel_stddev_at_rest=pixel_stddev_of(adjustment.adjuster, adjustment.num_reprojections),
         bend_m=start.bend_m,
@@ -195,7 +195,7 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> MapErrors:
             anchors={name: block for (what, name), block in rest.blocks.items() if what == "anchor"},
             residual_stddev=bending_factor * rest.run.pixel_stddev,
             refined_params=rest.refined_params,
-            firm_frame_ids=rest.firm_ids,
+            firm_frame_ids=rest.parts[0],
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)

@@ -160,12 +160,21 @@ def _renamed(survey: FinishedRun) -> FinishedRun:
 
 
 def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """Give tags new ids where two surveys use one id with different lever arms; otherwise it is the same tag."""
+    """Give tags new ids where two surveys use one id with different lever arms or at once; otherwise it is one tag."""
     arms: dict[str, list[Array]] = {}
+    spans_s: dict[str, list[tuple[float, float]]] = {}
     for survey in surveys:
+        times_s = survey.path.timestamps_s
         for tag_id, arm in survey.tags_in_cam_m.items():
             arms.setdefault(tag_id, []).append(arm)
+            if times_s is not None:
+                spans_s.setdefault(tag_id, []).append((times_s[0], times_s[-1]))
     differ = {tag_id for tag_id, places in arms.items() if np.ptp(places, axis=0).max() > 0}
+    # A tag cannot be on two cameras at once.
+    for tag_id, spans in spans_s.items():
+        starts_s, ends_s = np.array(sorted(spans)).T
+        if np.any(starts_s[1:] < np.maximum.accumulate(ends_s)[:-1]):
+            differ.add(tag_id)
     return [
         replace(
             survey,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.colmap.pieces import LoosePiece, loose_pieces
+from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_pieces
 from rangesfm.errors import GeometryError, number_text
+from rangesfm.estimation.map_posterior import firm_poses
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
@@ -30,55 +29,29 @@ from rangesfm.util.geometry.numerics import NOTHING_KNOWN
 _ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusal
 
 
-def metric_map(
-    run: SurveyRun, path: PathOfModel, *, refine: bool, joined: Sequence[pycolmap.Reconstruction] = ()
-) -> MetricResult:
+def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResult:
     """Scale a map, refine it if asked for, and judge the final map.
-
-    Args:
-        joined: the models of which the map is made, each scaled and placed on its own; empty where it is one model.
 
     Raises:
         GeometryError: the scale is not determined, or is less certain than asked for.
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     with run.journal.stage("scale"):
-        pieces = _loose(path.sfm, joined)
-        # Which parts hang together, and which measurements contradict the others, depends on how the photos may bend.
-        depends = pieces or run.inputs.may_be_left_out or not refine
+        # What parts of the map are known of, and which measurements contradict the others, depends on how photos bend.
+        depends = loose_pieces(path.sfm) or run.inputs.may_be_left_out or not refine
         bending = bending_by_survey(run.survey, path) if depends else path.as_walk
-        pieces = _not_held(pieces, bending)
         metric = scale_by_survey(run, path, bending, is_a_start=refine)
+        is_firm = firm_poses(metric.estimate.on_map)
+        if isinstance(bending, PhotoBending) and is_firm is not None and not np.array_equal(is_firm, bending.is_firm):
+            metric = scale_by_survey(run, path, replace(bending, is_firm=is_firm), is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
             metric = with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
         metric = close_loops_of_survey(run, metric)
-        loops, final = None if metric.kept is None else metric.kept.loops, metric.final
-        if pieces and loops is not None and loops.closed:  # loops hold pieces that neighbours do not
-            closed = replace(path, sfm=final, trajectory=path.trajectory.as_in(final))
-            pieces = _not_held(_loose(final, joined), bending_by_survey(run.survey, closed))
-    of_pieces = doubts_of_pieces(pieces, path.sfm.num_reg_images())
+    of_pieces = tuple(doubts_of_pieces(loose_pieces(metric.final), metric.all_measured, path.sfm.num_reg_images()))
     run.journal.warn(*(doubt.reason for doubt in of_pieces))
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
-
-
-def _loose(model: pycolmap.Reconstruction, joined: Sequence[pycolmap.Reconstruction]) -> tuple[LoosePiece, ...]:
-    """Return the loose parts of a map, without those that are models which measurements have placed."""
-    names = [{image.name for image in each.images.values() if image.has_pose} for each in joined]
-
-    def is_placed(piece: LoosePiece) -> bool:
-        part = {*piece.image_names}
-        return bool(names) and all(of_model <= part or of_model.isdisjoint(part) for of_model in names)
-
-    return tuple(piece for piece in loose_pieces(model) if not is_placed(piece))
-
-
-def _not_held(pieces: tuple[LoosePiece, ...], bending: MapBending) -> tuple[LoosePiece, ...]:
-    """Return the parts of a model that share few points with the rest, if its photos do not determine their scale."""
-    if not isinstance(bending, PhotoBending):  # the photos determine nothing, or are too many to tell
-        return pieces
-    return tuple(piece for piece in pieces if not bending.hold_together(piece.image_names))
 
 
 def scale_by_survey(run: SurveyRun, path: PathOfModel, bending: MapBending, *, is_a_start: bool) -> MetricResult:

@@ -15,9 +15,9 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import why_broken
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.drift import bend
-from rangesfm.estimation.map_posterior import errors_at_estimate, likely_bend
+from rangesfm.estimation.map_posterior import errors_at_estimate, firm_poses, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
-from rangesfm.estimation.photo_bending import PhotoBending
+from rangesfm.estimation.photo_bending import PhotoBending, parts_of_path
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import Loop
 from rangesfm.estimation.with_ranges import refined_ranges, summarize
@@ -169,15 +169,22 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, is_firm: Mask) -> MapBen
     if rest.equations is not None:
         with contextlib.suppress(GeometryError):  # the photos do not determine the map up to a similarity
             photos = PhotosAlone(rest.equations, rest.pixel_stddev_at_rest)
-            return PhotoBending(photos, path, is_firm, is_at_optimum=False)
+            return PhotoBending(photos, path, parts_of_path(path, rest.parts), is_firm, is_at_optimum=False)
     return WalkBending(path)
 
 
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap:
     """Return a map at rest with all that is measured in it."""
+    of_largest = np.isin(metric.trajectory.frame_ids, rest.parts[0])
+    found = _measured_in(run, metric, rest, of_largest)
+    is_firm = firm_poses(found)
+    return found if is_firm is None or np.array_equal(is_firm, of_largest) else _measured_in(run, metric, rest, is_firm)
+
+
+def _measured_in(run: SurveyRun, metric: MetricResult, rest: MapAtRest, is_firm: Mask) -> JointMap:
+    """Return a map at rest with all that is measured in it; ``is_firm``: (k,) poses of the path that are its size."""
     model, before = rest.problem.metric, metric.estimate.on_map.kinds
     path = metric.trajectory.as_in(model)
-    is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, is_firm)
     of_model = MapOfPhotos(model, bending, run.survey, metric.observations, scale, before, rest)

@@ -161,8 +161,7 @@ def map_in_metres(
         path, verdicts = join_models(run, paths, must_join=must_join)
         run = _in_map(run, path.sfm)
     # Scale, refinement of photos and ranges together, and judgement of the final map.
-    joined = [part.sfm for part, model in zip(paths, verdicts, strict=False) if model.joined_from_sfm is not None]
-    made = replace(metric_map(run, path, refine=refine, joined=joined), models=verdicts)
+    made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:
         made = with_likeliest_cause(run, made)
     return made.in_given_coordinates()

@@ -20,6 +20,7 @@ BENDS = {
     "scale_drift": "drift of the map's scale along the path",
     "heading_drift": "drift of the map's heading along the path",
     "bending": "bending of the map",
+    "loose_parts": "size and place of parts of the map that its photos hardly tie to the rest",
 }
 """Components that are errors of the map itself, with descriptions; their effect depends on the map."""
 
@@ -48,7 +49,8 @@ class Bending:
 
     Attributes:
         parts: components of these errors, in metres.
-        formal_m2: (c, c) covariance expected from the photos' residuals; zero if photos were not used.
+        formal_m2: (c, c) covariance expected from the photos' residuals, without that of loose parts; zero if photos
+            were not used.
         shift_m: (c,) change of the functions if the map moves to the minimum of the photos alone.
         given_sizes: sizes of errors in the map, by name, if none is to be learnt, as where nothing was measured yet;
             those that are missing are usual ones. None: they are learnt.

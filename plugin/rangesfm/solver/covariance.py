@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from copy import copy
 from types import MappingProxyType
 
 import numpy as np
@@ -91,29 +91,45 @@ class PhotosAlone:
         self._rows = equations.columns.of_blocks(seen)
         self._equations, self._columns = equations, equations.columns.subset(seen)
         self.gradient, self._stddev = equations.gradient[self._rows], residual_stddev
+        self._more = np.zeros((len(self.gradient), 0)), np.zeros(0)
         _, self._inverse = _held_if_loose(equations, self._inverse_of)
 
     def _inverse_of(self, equations: NormalEquations) -> _Inverse:
         rows = self._rows
         return _Inverse(equations.of_photos[rows][:, rows], equations.free_of_photos[rows], self._columns)
 
+    def with_more(self, steps: Array, variances: Array) -> PhotosAlone:
+        """Return a copy in which independent errors along (n, m) steps have (m,) more variance, less if negative."""
+        found = copy(self)
+        found._more = steps, variances
+        return found
+
     def solve(self, right: Array) -> Array:
         """Return the covariance of the steps times (n, k)."""
-        return self._stddev**2 * self._inverse.solve(right)
+        steps, variances = self._more
+        return self._stddev**2 * self._inverse.solve(right) + steps @ (variances[:, None] * (steps.T @ right))
 
     def blocks(self) -> Callable[[int], Array]:
         """Return a function that returns the covariance of the steps of one block, by the first of its columns."""
-        found = self._inverse.diagonal_blocks()
-        return lambda start: self._stddev**2 * found[self._columns.index_at(start)]
+        found, (steps, variances) = self._inverse.diagonal_blocks(), self._more
+
+        def block(start: int) -> Array:
+            index = self._columns.index_at(start)
+            own = steps[self._columns.span(index)]
+            return np.asarray(self._stddev**2 * found[index] + own * variances @ own.T)
+
+        return block
 
     def parts(self, refined_params: Mapping[int, Sequence[int]]) -> list[PartSteps]:
         """Return frames, sensors and cameras by the steps; arguments as of ``joint_covariance``."""
         return [*_parts(self._equations, self._columns, {}, refined_params)]
 
-    @cached_property
+    @property
     def at_minimum(self) -> Array:
         """Return the (n,) steps to the minimum of the photos alone."""
-        return -self._inverse.solve(self.gradient[:, None])[:, 0]
+        steps, variances = self._more
+        more = steps @ (variances * (steps.T @ self.gradient)) / self._stddev**2
+        return -self._inverse.solve(self.gradient[:, None])[:, 0] - more
 
     def by_steps(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> Array:
         """Return the derivatives (n, c) of functions that do not depend on the place and the size of the map.
