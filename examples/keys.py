@@ -3,7 +3,7 @@
 The page is written by: python examples/keys.py > examples/keys.md
 """
 
-from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
+from rangesfm.planning.plan_file import plan_tables
 from rangesfm.survey.settings import KEYS, SURVEY_TABLES
 
 HEAD = """# Keys of a survey file
@@ -30,7 +30,7 @@ def main() -> None:
     print(
         "# Keys of a plan\n\nThese are for the file that `rangesfm plan` reads; [how to plan a survey](planning.md).\n"
     )
-    for table, options in PLAN_TABLES.items():
+    for table, options in plan_tables().items():
         print(f"## [{table}] of a plan\n\n{options.__doc__}\n\n| key | value | meaning |\n|---|---|---|")
         for key in options.keys().values():
             print(f"| `{key.name}` | {cell(key.expected)} | {cell(key.meaning)} |")
