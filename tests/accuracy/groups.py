@@ -21,6 +21,7 @@ from tests.accuracy.figures import Figure, Values
 from tests.benchmarks import reconstruction
 from tests.simulated.surveys import SITES, simulated, surveyed
 from tests.studies import drifting_maps, growth, known_positions, mistakes, random_surveys, real_logs
+from tests.studies.kept_runs import KeptRuns
 from tests.studies.measured_distances import KINDS
 
 from rangesfm.demo.survey import PHOTOS
@@ -192,8 +193,9 @@ def mistakes_of_survey(site_number: int, seed: int, num: int) -> Cases:
     site = SITES[site_number]
     all_kinds = mistakes.kinds(list(site.anchors_m) if site.anchor_frame != "unknown" else [])
     drawn = np.random.default_rng([seed, site_number]).choice(len(all_kinds), num, replace=False)
-    made = mistakes.runs_of_seed(site.name, [(int(k), all_kinds[k]) for k in drawn], partial(surveyed, site), seed, {})
-    return {f"{site.name}, {line['kind']} {seed}": of_mistake(line) for line in made}
+    kept = KeptRuns(None, *mistakes.RUN_NAMES)
+    mistakes.run_seed(kept, site.name, [(int(k), all_kinds[k]) for k in drawn], partial(surveyed, site), seed)
+    return {f"{site.name}, {line['kind']} {seed}": of_mistake(line) for line in kept.rows}
 
 
 def of_mistake(line: dict[str, Any]) -> Values:
@@ -233,16 +235,16 @@ MISTAKE_FIGURES = (
 )
 
 
-def run_command(*words: str) -> dict[str, Any] | None:
+def run_command(output_path: Path, *words: str) -> dict[str, Any] | None:
     """Run a command of the package that writes a result; return ``result.json``, or None if it is refused."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "rangesfm", *words, "--no_report", "--quiet", "--output_path", f"{folder}/out"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode not in (0, 3):
-            raise RuntimeError(f"{' '.join(words)}: {done.stderr}")
-        return (
-            None if done.returncode else json.loads((Path(folder) / "out" / "result.json").read_text(encoding="utf-8"))
-        )
+    command = [sys.executable, "-m", "rangesfm", *words, "--no_report", "--quiet", "--output_path", str(output_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 3):
+        raise RuntimeError(f"{' '.join(words)}: {done.stderr}")
+    if done.returncode == 3:
+        return None
+    result: dict[str, Any] = json.loads((output_path / "result.json").read_text(encoding="utf-8"))
+    return result
 
 
 def of_result(result: dict[str, Any] | None) -> Values:
@@ -264,41 +266,28 @@ def room(data: Path, seed: int, with_single_anchors: bool) -> Cases:
     """
     folder = data / "room_env1"
     with tempfile.TemporaryDirectory() as scratch:
+        mapped, refined = Path(scratch) / "mapped", Path(scratch) / "refined"
         survey = [str(EXAMPLES / "handheld_room.toml"), "--base_path", str(folder), "--seed", str(seed)]
-        subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "rangesfm",
-                "run",
-                *survey,
-                "--quiet",
-                "--no_report",
-                "--output_path",
-                f"{scratch}/out",
-            ],
-            check=True,
-            capture_output=True,
-        )
-        result = json.loads((Path(scratch) / "out" / "result.json").read_text(encoding="utf-8"))
+        result = run_command(mapped, "run", *survey)
+        assert result is not None
         seconds = result["seconds"]
         before = sum(seconds.get(stage, 0.0) for stage in ("features", "matching", "mapping"))
         after = sum(seconds.values()) - before
         found: Cases = {f"surveyed {seed}": {**of_result(result), "after_mapping": after / before}}
         photos = ["--images", str(folder / "images.csv"), "--reference", str(folder / "groundtruth.csv")]
-        of_map = ["refine", "--input_path", f"{scratch}/out/sparse/0", *photos]
+        of_map = ["refine", "--input_path", str(mapped / "sparse" / "0"), *photos]
         ranges = ["--ranges", str(folder / "uwb.csv"), "--ranges_time_offset", "0"]
         refine = [*of_map, *ranges, "--tag_in_cam", "-0.0012,-0.09,-0.0663", "--anchor_frame"]
-        found[f"unknown {seed}"] = of_result(run_command(*refine, "unknown"))
+        found[f"unknown {seed}"] = of_result(run_command(refined, *refine, "unknown"))
         for at in (path for path in (folder, data / "public" / "inrol_env1") if (path / "imu.txt").is_file()):
             sensor = ["--imu", str(at / "imu.txt"), "--imu_in_cam", "-0.0013,-0.08,-0.0664"]
-            found[f"inertial sensor alone {seed}"] = of_result(run_command(*of_map, *sensor))
+            found[f"inertial sensor alone {seed}"] = of_result(run_command(refined, *of_map, *sensor))
             anchors = ["site", "--anchors", str(folder / "anchors_antennas.csv")]
-            found[f"surveyed, inertial sensor {seed}"] = of_result(run_command(*refine, *anchors, *sensor))
+            found[f"surveyed, inertial sensor {seed}"] = of_result(run_command(refined, *refine, *anchors, *sensor))
         with (folder / "anchors_antennas.csv").open(encoding="utf-8") as file:
             ids = [row["anchor_id"] for row in csv.DictReader(file)] if with_single_anchors else []
         for name in ids:
-            found[f"only {name}, {seed}"] = of_result(run_command(*refine, "unknown", "--use_anchors", name))
+            found[f"only {name}, {seed}"] = of_result(run_command(refined, *refine, "unknown", "--use_anchors", name))
     return found
 
 
@@ -320,7 +309,9 @@ def tag_map(data: Path, stage: str, anchors: str | None, offset: str) -> Cases:
     words += ["--anchor_frame", "unknown"] if anchors is None else ["--anchors", str(folder / "anchors.csv")]
     if anchors not in (None, "all"):
         words += ["--anchor_frame", "unknown", "--use_anchors", str(anchors)]
-    return {f"{stage}, anchors {anchors or 'unknown'}, offset {offset}": of_result(run_command(*words))}
+    with tempfile.TemporaryDirectory() as scratch:
+        result = run_command(Path(scratch) / "out", *words)
+    return {f"{stage}, anchors {anchors or 'unknown'}, offset {offset}": of_result(result)}
 
 
 def tag_tasks(data: Path | None, quick: bool) -> list[Task]:

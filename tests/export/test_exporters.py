@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tests.export.models import centers_of, read_ply, synthesized, xyz
-from tests.outputs import names_in
+from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
@@ -23,6 +23,7 @@ from rangesfm.export import (
     export_model,
     write_camera_positions,
 )
+from rangesfm.export.colmap import write_model
 from rangesfm.pipeline.export_result import export_result
 from rangesfm.util.geometry.similarity import Similarity
 
@@ -49,9 +50,10 @@ def times_of(model: pycolmap.Reconstruction) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ["colmap", "colmap_text"])
 def test_colmap_models_are_read_back_whole(tmp_path: Path, model: pycolmap.Reconstruction, name: str) -> None:
+    write_model(model, tmp_path / name, as_text=name == "colmap")  # an older one in the other form
     (path,) = export_model(model, [name], tmp_path)
     read = pycolmap.Reconstruction(path)
-    assert (path / "points3D.txt").exists() == (name == "colmap_text")
+    assert {file.suffix for file in paths_in(path)} == {".txt" if name == "colmap_text" else ".bin"}
     assert read.num_points3D() == model.num_points3D()
     assert read.compute_mean_reprojection_error() == pytest.approx(model.compute_mean_reprojection_error())
     for image_name, center in centers_of(model).items():
@@ -122,6 +124,8 @@ def test_an_empty_model_gives_empty_files(tmp_path: Path) -> None:
 def test_the_transform_carries_the_unscaled_model_to_the_metric_one(
     tmp_path: Path, model: pycolmap.Reconstruction
 ) -> None:
+    with pytest.raises(InputError, match="'transform' needs metric_from_sfm"):
+        export_model(model, ["transform"], tmp_path)
     line, matrix = export_model(model, ["transform"], tmp_path, metric_from_sfm=METRIC_FROM_SFM)
     assert [line.name, matrix.name] == ["transform_colmap_4.txt", "transform_colmap_3.8.txt"]
     scale, qw, qx, qy, qz, *translation = map(float, line.read_text().split())

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from tests.simulated.files import write_anchors, write_model
-from tests.simulated.model import SyntheticModel, _Frames, _reconstruction, synthetic_model
+from tests.simulated.model import Frames, synthetic_model
 from tests.simulated.path import lap_path, look_at
 from tests.simulated.surveys import (
     SITE_ANCHORS_M,
@@ -272,8 +272,8 @@ def two_aisles(
     shelf = rng.uniform([-2.0, 1.4, 0.0], [length_m + 2.0, 1.9, 3.0], (num, 3))
     clutter = rng.uniform([length_m - 1.5, -apart_m - 1, 0], [length_m + 2, 3.5, 3], (num // 2, 3))
     points = np.concatenate([shelf, shelf - [0.0, apart_m, 0.0], clutter])
-    frames = _Frames(centers, turns, 500.0, (960, 640))
-    numbers = np.arange(len(x))
+    numbers = np.arange(float(len(x)))
+    frames = Frames(numbers, centers, turns, 500.0, (960, 640))
     sees = _sees(frames, points)
     in_first, in_second = numbers < num_keyframes, numbers >= len(x) - num_keyframes
     sees[:num] &= ~in_second
@@ -311,31 +311,25 @@ def around_a_room(num_keyframes: int = 60, *, pixel_stddev: float = 1.0, seed: i
     centers[:, 2] += 0.1 * np.sin(np.arange(num_keyframes))
     to_wall = rng.uniform(6.0, 7.0, len(around))
     points = np.column_stack([to_wall * np.cos(around), to_wall * np.sin(around), rng.uniform(0.0, 3.0, len(around))])
-    frames = _Frames(centers, look_at(centers, centers + outward), 500.0, (960, 640))
+    frames = Frames(np.arange(float(num_keyframes)), centers, look_at(centers, centers + outward), 500.0, (960, 640))
     sees = _sees(frames, points)
     keep = sees.sum(axis=1) > 1
     return _walk(frames, points[keep], sees[keep], pixel_stddev, rng)
 
 
-def _sees(frames: _Frames, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def _sees(frames: Frames, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """Return whether each photo of a walk sees each of the points (p, photos), which are not far away."""
     depth = np.einsum("fi,pfi->pf", frames.world_from_cam[:, :, 2], points[:, None] - frames.centers)
     return np.asarray(frames.sees(points, np.arange(len(frames.centers)), 0.5) & (depth < 3.5))
 
 
 def _walk(
-    frames: _Frames,
+    frames: Frames,
     points: npt.NDArray[np.float64],
     sees: npt.NDArray[np.bool_],
     pixel_stddev: float,
     rng: np.random.Generator,
 ) -> LoopedSurvey:
     """Return the survey of a walk with four anchors, by which photos see each point (p, photos)."""
-    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=960, height=640, params=[500, 500, 480, 320])
-    names = [f"frame_{k:05d}.jpg" for k in range(len(frames.centers))]
-    seen_by = [np.flatnonzero(row) for row in sees]
-    model = _reconstruction(frames, names, camera, points, seen_by, pixel_stddev, IDENTITY, rng)
-    times = dict(zip(names, np.arange(len(names), dtype=np.float64).tolist(), strict=True))
-    anchors = {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}
-    made = SyntheticModel(model, IDENTITY, times, frames.centers, frames.world_from_cam)
-    return LoopedSurvey(Truth(made, anchors, "site"), 8)
+    made = frames.seeing(points, [np.flatnonzero(row) for row in sees], pixel_stddev, IDENTITY, rng)
+    return LoopedSurvey(Truth(made, {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}, "site"), 8)

@@ -67,24 +67,9 @@ def synthetic_model(
         seed: of points, noise and similarity.
     """
     rng = np.random.default_rng(seed)
-    camera = pycolmap.Camera(
-        camera_id=1,
-        model="PINHOLE",
-        width=image_size[0],
-        height=image_size[1],
-        params=[focal_px, focal_px, image_size[0] / 2, image_size[1] / 2],
-    )
-    frames = _Frames(centers_m, world_from_cam, focal_px, image_size)
+    frames = Frames(timestamps_s, centers_m, world_from_cam, focal_px, image_size)
     points, seen_by = _scatter_points(frames, num_observations, max_track_length, depth_range_m, rng)
-    metric_from_sfm = metric_from_sfm or random_similarity(rng)
-    names = [f"frame_{number:05d}.jpg" for number in range(1, len(centers_m) + 1)]
-    return SyntheticModel(
-        _reconstruction(frames, names, camera, points, seen_by, pixel_stddev, metric_from_sfm.inverse(), rng),
-        metric_from_sfm,
-        dict(zip(names, np.asarray(timestamps_s, dtype=np.float64).tolist(), strict=True)),
-        centers_m,
-        world_from_cam,
-    )
+    return frames.seeing(points, seen_by, pixel_stddev, metric_from_sfm or random_similarity(rng), rng)
 
 
 def random_similarity(rng: np.random.Generator) -> Similarity:
@@ -94,9 +79,10 @@ def random_similarity(rng: np.random.Generator) -> Similarity:
 
 
 @dataclass(frozen=True)
-class _Frames:
+class Frames:
     """Poses in metres and the camera that they share."""
 
+    timestamps_s: FloatArray
     centers: FloatArray
     world_from_cam: FloatArray
     focal_px: float
@@ -126,9 +112,23 @@ class _Frames:
         in_cam = np.column_stack([(pixels - np.array(self.image_size) / 2) / self.focal_px, np.ones(count)])
         return np.asarray(self.centers[frame] + (depths[:, None] * in_cam) @ self.world_from_cam[frame].T)
 
+    def seeing(
+        self,
+        points: FloatArray,
+        seen_by: list[npt.NDArray[np.int64]],
+        pixel_stddev: float,
+        metric_from_sfm: Similarity,
+        rng: np.random.Generator,
+    ) -> SyntheticModel:
+        """Return the model of (p, 3) points, each seen by some frames, in a world of its own."""
+        names = [f"frame_{number:05d}.jpg" for number in range(1, len(self.centers) + 1)]
+        times = dict(zip(names, np.asarray(self.timestamps_s, dtype=np.float64).tolist(), strict=True))
+        found = _reconstruction(self, names, points, seen_by, pixel_stddev, metric_from_sfm.inverse(), rng)
+        return SyntheticModel(found, metric_from_sfm, times, self.centers, self.world_from_cam)
+
 
 def _scatter_points(
-    frames: _Frames,
+    frames: Frames,
     num_observations: int,
     max_track_length: int | None,
     depth_range_m: tuple[float, float],
@@ -162,9 +162,8 @@ def _scatter_points(
 
 
 def _reconstruction(
-    frames: _Frames,
+    frames: Frames,
     names: list[str],
-    camera: pycolmap.Camera,
     points: FloatArray,
     seen_by: list[npt.NDArray[np.int64]],
     pixel_stddev: float,
@@ -176,6 +175,9 @@ def _reconstruction(
     observed = np.repeat(np.arange(len(points)), [len(by) for by in seen_by])
     pixels, _ = frames.project(points[observed], observing)
     pixels = pixels + pixel_stddev * rng.standard_normal(pixels.shape)
+    (width, height), focal_px = frames.image_size, frames.focal_px
+    params = [focal_px, focal_px, width / 2, height / 2]
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=params)
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(camera)
     index_in_image = np.empty(len(observing), dtype=np.int64)
@@ -194,7 +196,7 @@ def _reconstruction(
     return reconstruction
 
 
-def _cam_from_world(frames: _Frames, frame: int, sfm_from_metric: Similarity) -> pycolmap.Rigid3d:
+def _cam_from_world(frames: Frames, frame: int, sfm_from_metric: Similarity) -> pycolmap.Rigid3d:
     cam_from_world = frames.world_from_cam[frame].T @ sfm_from_metric.rotation.T
     center = sfm_from_metric.apply(frames.centers[frame])
     return pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world), -cam_from_world @ center)

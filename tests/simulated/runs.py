@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from unittest.mock import patch
 
 import numpy as np
-from tests.simulated.surveys import MadeSurvey
+from tests.simulated.surveys import Array, MadeSurvey
 
 from rangesfm.diagnostics.place import by_similarity
 from rangesfm.errors import GeometryError, SolverError
@@ -17,8 +17,11 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.joint_map import find_kind
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.mistakes import MistakeTests
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
@@ -31,21 +34,40 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.similarity import align_points
 
+NO_RANGES = RangeLog.from_arrays([], [])
 
-def run_stages(survey: MadeSurvey, seed: int, inputs: RangingInputs | None = None) -> MetricResult:
+
+def inputs_of(
+    survey: MadeSurvey | None, tape: Tape = Tape(), positions: SurveyedPositions | None = None
+) -> RangingInputs:
+    """Return what is measured: the ranges of a survey, or none, and what is known beside them."""
+    radio: tuple[RangeLog, Array, tuple[Anchor, ...], str] = NO_RANGES, np.zeros((0, 3)), (), "unknown"
+    if survey is not None:
+        radio = survey.log, survey.tag_in_cam_m[None], survey.anchors, survey.anchor_frame
+    return RangingInputs(*radio, Site(), tape, positions=positions or SurveyedPositions())
+
+
+def run_stages(
+    survey: MadeSurvey,
+    seed: int,
+    inputs: RangingInputs | None = None,
+    *,
+    intrinsics_are_known: bool = True,
+    is_refined: bool = True,
+) -> MetricResult:
     """Run all stages from the scale on, with all defaults.
 
     Args:
         inputs: what is measured; None: the survey's ranges.
+        is_refined: whether a map with points is refined, too.
     """
-    settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
-    if inputs is None:
-        arms_m, site = survey.tag_in_cam_m[None], Site(np.zeros(3))
-        inputs = RangingInputs(survey.log, arms_m, survey.anchors, survey.anchor_frame, site, Tape())
+    settings = Survey().changed({"output.seed": seed, "mapper.num_threads": 1})
+    settings = settings.changed({"camera.refine_intrinsics": not intrinsics_are_known})
+    inputs = inputs or inputs_of(survey)
     observations = associate(inputs.log, survey.trajectory, inputs.tag_in_cam_m, time_offset_s=survey.time_offset_s)
     path = PathOfModel("sparse/0", survey.model, survey.trajectory, observations)
     run = SurveyRun(settings, inputs, Journal(Progress()))
-    return map_in_metres(run, [path], refine=survey.sfm is not None)
+    return map_in_metres(run, [path], refine=is_refined and survey.sfm is not None)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Check whether advice gains what it promises: in ten weak surveys it is followed, and both are simulated.
 
-Run: python -m tests.studies.advice_followed --rows FILE [--num_seeds 100] [--surveys NAME]
+Run: python -m tests.studies.advice_followed [--out FILE] [--num_seeds 100] [--kinds NAME ...]
 
 For each survey, three pieces of advice are followed: the first for the scale, the first for the scale that is no taped
 distance, and the first for the place. Prints what each promises and what it achieves, as the stddev afterwards relative
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from tests.studies.kept_runs import spread, study
+from tests.studies.kept_runs import seeds_parser, spread
 from tests.studies.planned_surveys import ROOM, runs_of, straight, survey, up_and_down, walk
 
 from rangesfm.planning.advice import Advice
@@ -51,13 +51,11 @@ def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
 
 
 def main() -> None:
-    asked = study(__doc__)
+    asked = seeds_parser(__doc__, list(SURVEYS), 100).parse_args()
     print(f"{'survey':30}{'for':>6}{'promised':>20}{'followed':>20}{'ratio':>14}  advice")
     off = []
-    for name, make in SURVEYS.items():
-        if not name.startswith(asked.beginning):
-            continue
-        plan = plan_survey(make())
+    for name in asked.kinds:
+        plan = plan_survey(SURVEYS[name]())
         before = runs_of(asked, name, plan.expected.planned, num_whole=0)
         for what, advice in first_of(plan):
             after = runs_of(asked, f"{name}: {advice.words}", advice.planned, num_whole=0)

@@ -36,10 +36,10 @@ if fewer than 90 % of the scales are covered.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from tests.simulated.path import lap_path
-from tests.simulated.runs import run_stages
+from tests.simulated.runs import inputs_of, run_stages
 from tests.simulated.surveys import (
     HALL,
     TAG_IN_CAM_M,
@@ -59,20 +59,16 @@ from tests.simulated.surveys import (
     made,
     truth_of,
 )
-from tests.studies.kept_runs import run_seeds, seeds_parser
-from tests.studies.known_positions import NO_RANGES, POINT_STDDEV_M, RECEIVERS, Receiver
+from tests.studies.kept_runs import runs_of, seeds_parser
+from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, Receiver, antenna_track
 from tests.studies.measured_distances import MAST_M, marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import RangesfmError
 from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
-from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.options import RangesOptions
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import align_points, rmse
@@ -189,11 +185,9 @@ class LapWithoutRanges:
             times = np.arange(times[0] + 0.2, times[-1], 0.5)
         at_m = self.path.centers(times) + self.path.world_from_cam(times) @ TAG_IN_CAM_M
         at_m = at_m + receiver.errors_m(times, self.rng)
-        covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
         moments = ByPhoto(self.survey.trajectory.image_names) if of_photos else ByTime(times)
-        log = PositionLog(at_m, covariances, moments, np.arange(len(times)))
         offset = None if of_photos else TimeOffset.given(0.0)
-        return SurveyedPositions(antenna=AntennaTrack(log, TAG_IN_CAM_M, offset, RangesOptions()))
+        return SurveyedPositions(antenna=antenna_track(at_m, receiver.noise_m, moments, TAG_IN_CAM_M, offset))
 
     def marks(self, num: int) -> tuple[dict[str, Marker], dict[str, Array]]:
         """Return marks and their true positions, evenly along the path."""
@@ -249,7 +243,7 @@ class LapWithoutRanges:
             known = self.points(NUM_POINTS[which % len(NUM_POINTS)])
         else:
             tape = self.lengths(NUM_LENGTHS[which % len(NUM_LENGTHS)])
-        return RangingInputs(NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), tape, positions=known)
+        return inputs_of(None, tape, known)
 
 
 def told(kind: str, seed: int, data: Path | None = None) -> Line:
@@ -353,7 +347,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path)
     asked = parser.parse_args()
     kinds = asked.kinds or [*surveys(asked.data), *WITHOUT_RANGES]
-    lines = run_seeds(asked, kinds, lambda kind, seed: told(kind, seed, asked.data), json.dumps)
+    lines = [line for kind in kinds for line in runs_of(asked, kind, partial(told, kind, data=asked.data))]
     print(*report(lines), sep="\n")
     covered = [line["covered"] for line in lines if not line["refused"]]
     return int(not covered or float(np.mean(covered)) < LEAST_COVERED)

@@ -35,8 +35,10 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial import KDTree
 from tests.peak_memory import peak_bytes
-from tests.simulated.model import SyntheticModel, _Frames, _reconstruction, random_similarity
+from tests.simulated.files import write_anchors, write_model
+from tests.simulated.model import Frames, random_similarity
 from tests.simulated.path import look_at
+from tests.simulated.surveys import drop_flat_points
 
 from rangesfm.cli import main as run_command
 from rangesfm.demo.simulated_radio import Radio, measure_ranges
@@ -57,19 +59,19 @@ TRACK_SHARES, TRACK_LENGTHS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0), (2, 3, 5, 
 STAGES = ("scale", "refinement", "judgement", "results")
 
 
-def frames_of(num: int) -> _Frames:
+def frames_of(num: int) -> Frames:
     """Return the true poses: to and fro over the field, looking ahead, a little up and down and to the sides."""
     num_in_row = max(round(np.sqrt(ROW_M * num)), 2)
     row, place = np.divmod(np.arange(num), num_in_row)
     is_back = row % 2 == 1
     along = np.where(is_back, num_in_row - 1 - place, place).astype(np.float64)
-    phase = np.arange(num)
+    phase = np.arange(float(num))
     centers = np.column_stack([along, ROW_M * row + 0.3 * np.sin(0.31 * phase), 1.7 + 0.3 * np.sin(0.23 * phase)])
     ahead = np.column_stack([np.where(is_back, -1.0, 1.0), 0.5 * np.sin(0.17 * phase), 0.1 * np.cos(0.29 * phase)])
-    return _Frames(centers, look_at(centers, centers + ahead), FOCAL_PX, IMAGE_SIZE)
+    return Frames(phase, centers, look_at(centers, centers + ahead), FOCAL_PX, IMAGE_SIZE)
 
 
-def tracks_of(frames: _Frames, num_observations: int, rng: np.random.Generator) -> tuple[Array, list[Indices]]:
+def tracks_of(frames: Frames, num_observations: int, rng: np.random.Generator) -> tuple[Array, list[Indices]]:
     """Draw points over the field and the frames that see each, in the order of time.
 
     Returns:
@@ -97,39 +99,27 @@ def simulate(folder: Path, num: int, num_ranges_each: int, num_observations: int
     rng = np.random.default_rng(seed)
     frames = frames_of(num)
     points, seen_by = tracks_of(frames, num_observations, rng)
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=IMAGE_SIZE[0], height=IMAGE_SIZE[1],
-        params=[FOCAL_PX, FOCAL_PX, IMAGE_SIZE[0] / 2, IMAGE_SIZE[1] / 2],
-    )  # fmt: skip
-    names = [f"frame_{k:05d}.jpg" for k in range(num)]
-    site_from_sfm = random_similarity(rng)
-    model = _reconstruction(frames, names, camera, points, seen_by, PIXEL_STDDEV, site_from_sfm.inverse(), rng)
-    (folder / "sparse").mkdir()
-    pycolmap.ObservationManager(model).filter_points3D_with_small_triangulation_angle(1.5, set(model.point3D_ids()))
-    model.write(folder / "sparse")
-    times = np.arange(num, dtype=np.float64)
-    made = SyntheticModel(model, site_from_sfm, dict(zip(names, times.tolist())), frames.centers, frames.world_from_cam)
-    write_ranges(folder, made, num_ranges_each, rng)
-    lines = [f"{name},{at!r}\n" for name, at in made.timestamps_s.items()]
-    (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
-    write_reference(Reference(frames.centers, ByPhoto(tuple(names))), folder / "reference.csv")
+    made = frames.seeing(points, seen_by, PIXEL_STDDEV, random_similarity(rng), rng)
+    drop_flat_points(made.reconstruction)
+    write_model(made.reconstruction, folder / "sparse", made.timestamps_s, folder / "images.csv")
+    write_ranges(folder, frames, num_ranges_each, rng)
+    write_reference(Reference(frames.centers, ByPhoto(tuple(made.timestamps_s))), folder / "reference.csv")
 
 
-def write_ranges(folder: Path, made: SyntheticModel, num_each: int, rng: np.random.Generator) -> None:
-    size = made.centers_m.max(axis=0)
+def write_ranges(folder: Path, frames: Frames, num_each: int, rng: np.random.Generator) -> None:
+    size = frames.centers.max(axis=0)
     along, across = (np.linspace(-2, end + 2, max(round(end / ANCHOR_M), 1) + 1) for end in size[:2])
     grid = np.array([(x, y, 0.5 + 3 * ((i + j) % 2)) for i, x in enumerate(along) for j, y in enumerate(across)])
     anchors = {f"A{k}": place for k, place in enumerate(grid)}
-    keyframe = np.repeat(np.arange(len(made.centers_m)), num_each)
-    tags = made.centers_m + made.world_from_cam @ np.array(TAG_IN_CAM_M)
+    keyframe = np.repeat(np.arange(len(frames.centers)), num_each)
+    tags = frames.centers + frames.world_from_cam @ np.array(TAG_IN_CAM_M)
     nearest = KDTree(grid).query(tags, k=NUM_NEAREST)[1]
     anchor = nearest[keyframe, np.tile(np.arange(num_each), len(tags)) % NUM_NEAREST]
-    times = np.array(list(made.timestamps_s.values()))[keyframe]
     biases = dict(zip(anchors, (0.03 * rng.standard_normal(len(grid))).tolist()))
     radio = Radio(range_stddev_m=0.1, range_bias_m=biases)
-    write_ranges_csv(measure_ranges(times, tags[keyframe], anchor, anchors, radio, seed=1), folder / "uwb.csv")
-    rows = [f"{name},{x!r},{y!r},{z!r}\n" for name, (x, y, z) in zip(anchors, grid.tolist())]
-    (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
+    log = measure_ranges(keyframe.astype(np.float64), tags[keyframe], anchor, anchors, radio, seed=1)
+    write_ranges_csv(log, folder / "uwb.csv")
+    write_anchors(folder / "anchors.csv", anchors)
 
 
 def refine(folder: Path, *, with_profile: bool) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,45 +55,13 @@ def seeds_parser(doc: str | None, kinds: Sequence[str] | None, num_seeds: int) -
     return parser
 
 
-def run_seeds(
-    asked: argparse.Namespace, kinds: Iterable[str], told: Callable[[str, int], Row], show: Callable[[Row], str]
-) -> list[Row]:
-    """Run each kind with each seed, show each run, and return the lines of all that were ever kept."""
-    kept = KeptRuns(asked.out, "kind", "seed")
-    for kind in kinds:
-        for seed in range(asked.seed, asked.seed + asked.num_seeds):
-            print(show(kept.run(partial(told, kind, seed), kind=kind, seed=seed)), flush=True)
-    return kept.rows
-
-
-@dataclass(frozen=True)
-class Study:
-    """The arguments of a study.
-
-    Attributes:
-        file: keeps the runs that are done, as JSON lines.
-        num_seeds: runs of each survey.
-        beginning: only surveys whose names begin with this text are run.
-    """
-
-    file: Path
-    num_seeds: int
-    beginning: str
-
-    def runs_of(self, name: str, run: Callable[[int], Row]) -> list[Row]:
-        """Return the runs of a survey."""
-        kept = KeptRuns(self.file, "survey", "seed")
-        return [kept.run(partial(run, seed), survey=name, seed=seed) for seed in range(self.num_seeds)]
-
-
-def study(doc: str | None) -> Study:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
-    parser.add_argument("--num_seeds", type=int, default=100)
-    parser.add_argument("--surveys", default="", help="only those whose name begins so")
-    args = parser.parse_args()
-    return Study(args.rows, args.num_seeds, args.surveys)
+def runs_of(asked: argparse.Namespace, kind: str, told: Callable[[int], Row]) -> list[Row]:
+    """Return the runs of a kind of survey with each seed."""
+    kept, rows = KeptRuns(asked.out, "kind", "seed"), []
+    for seed in range(asked.seed, asked.seed + asked.num_seeds):
+        print(f"{kind}, {seed}", file=sys.stderr)
+        rows.append(kept.run(partial(told, seed), kind=kind, seed=seed))
+    return rows
 
 
 def spread(rows: list[Row], name: str) -> tuple[float, float]:

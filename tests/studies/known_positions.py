@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tests.simulated.runs import run_stages
+from tests.simulated.runs import inputs_of, run_stages
 from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, Truth, photos_adjuster, simulated
 from tests.studies.kept_runs import KeptRuns, seeds_parser
 from tests.studies.measured_distances import KINDS, marks_in
@@ -41,22 +41,18 @@ from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.measurements.clock.offset import TimeOffset
-from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.result_records import points_entry
 from rangesfm.solver.covariance import PhotosAlone
 from rangesfm.solver.normal_equations import NormalEquations
-from rangesfm.survey.inputs import RangingInputs
-from rangesfm.util.geometry.moments import ByPhoto, ByTime
+from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.numerics import NORMAL_95
 from rangesfm.util.geometry.similarity import align_points, similarity_motions
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
@@ -67,7 +63,6 @@ Line = dict[str, Any]
 POINT_STDDEV_M = 0.01
 LEAST_COVERED = 0.9
 LEAP_S = 18.0
-NO_RANGES = RangeLog.from_arrays([], [])
 KINDS_OF_SURVEY = ("yard", "room", "orbit of a drone", "way that never returns")
 
 
@@ -102,23 +97,29 @@ def points_of(truth: Truth, rng: np.random.Generator) -> ControlPoints:
     return ControlPoints(points, markers)
 
 
+def antenna_track(
+    at_m: Array, stddev_m: float, moments: Moments, arm_m: Array | None = None, offset: TimeOffset | None = None
+) -> AntennaTrack:
+    """Return positions (n, 3) of an antenna, or of the camera without an arm; NaN: no stddev is stated."""
+    covariances = np.tile(stddev_m**2 * np.eye(3), (len(at_m), 1, 1))
+    log = PositionLog(at_m, covariances, moments, np.arange(len(at_m)))
+    return AntennaTrack(log, np.zeros(3) if arm_m is None else arm_m, offset, RangesOptions())
+
+
 def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> AntennaTrack:
     """Return positions of the antenna once a second; their time offset is not known."""
     first_s, last_s = survey.trajectory.times_s[[0, -1]].tolist()
     times, receiver = np.arange(first_s, last_s, 1.0), RECEIVERS["positions"]
     true_m = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
-    covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
-    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, ByTime(times), np.arange(len(times)))
-    return AntennaTrack(log, TAG_IN_CAM_M, None, RangesOptions())
+    at_m = true_m + receiver.errors_m(times, rng)
+    return antenna_track(at_m, receiver.noise_m, ByTime(times), TAG_IN_CAM_M)
 
 
 def exif_of(survey: MadeSurvey, rng: np.random.Generator) -> AntennaTrack:
     """Return a position of each photo, with the accuracy that is taken for EXIF positions without a word about it."""
     path = survey.trajectory
-    covariances = np.tile(AUTONOMOUS_STDDEV_M**2 * np.eye(3), (len(path), 1, 1))
     at_m = survey.true_centers_m + RECEIVERS["exif"].errors_m(path.times_s, rng)
-    log = PositionLog(at_m, covariances, ByPhoto(path.image_names), np.arange(len(path)))
-    return AntennaTrack(log, np.zeros(3), None, RangesOptions())
+    return antenna_track(at_m, AUTONOMOUS_STDDEV_M, ByPhoto(path.image_names))
 
 
 def arm_off(surveyed: SurveyedPositions) -> SurveyedPositions:
@@ -188,11 +189,7 @@ class Known:
     def run(self, surveyed: SurveyedPositions, seed: int) -> MetricResult:
         """Run all stages from the scale on, with all defaults."""
         survey = replace(self.survey, anchor_frame="site" if "anchors" in self.names else "unknown")
-        given = (survey.log, survey.tag_in_cam_m[None], survey.anchors)
-        log, arms_m, anchors = given if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)), ())
-        frame, site = survey.anchor_frame, Site(np.zeros(3))
-        inputs = RangingInputs(log, arms_m, anchors, frame, site, Tape(), positions=surveyed)
-        return run_stages(survey, seed, inputs)
+        return run_stages(survey, seed, inputs_of(survey if "ranges" in self.names else None, positions=surveyed))
 
     def bound(self, pixel_stddev: float) -> tuple[float, float]:
         """Return the Cramer-Rao bound of the scale (relative) and of a coordinate of the place, without ranges.

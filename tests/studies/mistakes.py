@@ -1,6 +1,6 @@
 """Measure how often a mistake in a survey is found and rightly named, and how often a clean survey is doubted.
 
-Run: python -m tests.studies.mistakes --out FILE [--num_seeds 20] [--num_clean 67] [--surveys hall] [--kinds anchor]
+Run: python -m tests.studies.mistakes [--out FILE] [--num_seeds 20] [--num_clean 67] [--surveys hall] [--kinds anchor]
      [--photos] [--room FOLDER --model FOLDER]
      python -m tests.studies.mistakes --out FILE --report
 
@@ -11,7 +11,8 @@ features a photo, tracks of eight photos, no loops), and all stages run, refinem
 range errors are like those of real radios: white noise, errors that last for seconds, errors that depend on direction
 and on distance, and ranges without line of sight. Each seed gives first a clean survey, then one with each kind of
 mistake that the survey allows. The mistake's size is one of several multiples of the smallest size that the tests of
-the clean survey say would be found. Each run is a line of the file, and runs that are there already are not repeated.
+the clean survey say would be found. With --out each run is a line of a file, and runs that are there already are not
+repeated.
 
 Reported for each survey and each kind: in how many runs a mistake was found, the right one was named at all, or was
 named first (or in the pair that nothing tells apart); the map was called good; and the map was called good though its
@@ -20,9 +21,7 @@ scale lies outside its interval or its place is more than three stddevs off.
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,14 +31,16 @@ import numpy as np
 import numpy.typing as npt
 from tests.simulated.runs import Run, run, run_with_photos
 from tests.simulated.surveys import SITES, MadeSurvey, surveyed, surveyed_with_photos
+from tests.studies.kept_runs import KeptRuns, seeds_parser
 from tests.studies.real_room import real_room
 
 Array = npt.NDArray[np.float64]
 
 Mistake = Callable[[MadeSurvey, float, np.random.Generator], None]
 Line = dict[str, Any]
-Lines = dict[tuple[str, str, int], Line]
+Make = Callable[[int], MadeSurvey]
 CLEAN = "clean"
+RUN_NAMES = ("survey", "kind", "seed")
 # A camera's axes (x right, y down, z forward) in terms of a robot's (x forward, y left, z up).
 Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -70,38 +71,42 @@ def kinds(ids: list[str]) -> list[Kind]:
     for k, name in enumerate(ids[:3]):
         for axis, letter in enumerate("xyz"):
             right: tuple[str, ...] = (f"anchor place {name}", f"anchor coordinate {name} {letter}")
-            made.append(Kind(f"{name} {letter} typed wrong", _place(name, axis), right, ("anchor place", name)))
+            made.append(
+                Kind(f"{name} {letter} typed wrong", partial(_place, name, axis), right, ("anchor place", name))
+            )
         right = (f"anchor bias {name}",)
-        made.append(Kind(f"{name} reads long", _bias(name), right, ("anchor bias", name)))
-        made.append(Kind(f"{name} reads short", _bias(name, -1), right, ("anchor bias", name)))
+        made.append(Kind(f"{name} reads long", partial(_bias, name, 1), right, ("anchor bias", name)))
+        made.append(Kind(f"{name} reads short", partial(_bias, name, -1), right, ("anchor bias", name)))
         right = (f"anchor moved {name}",)
-        made.append(Kind(f"{name} moved", _moved(name, (0.3, 0.5, 0.6)[k]), right, ("anchor moved", name)))
+        made.append(Kind(f"{name} moved", partial(_moved, name, (0.3, 0.5, 0.6)[k]), right, ("anchor moved", name)))
         right = (f"anchor step {name}",)
-        made.append(Kind(f"{name} steps", _step(name, (0.5, 0.4, 0.6)[k]), right, ("anchor step", name)))
+        made.append(Kind(f"{name} steps", partial(_step, name, (0.5, 0.4, 0.6)[k]), right, ("anchor step", name)))
         right = (f"anchor stretch {name}", f"anchor step {name}")
-        made.append(Kind(f"{name} blocked", _stretch(name, (0.2, 0.5, 0.7)[k]), right, ("anchor stretch", name)))
+        made.append(
+            Kind(f"{name} blocked", partial(_stretch, name, (0.2, 0.5, 0.7)[k]), right, ("anchor stretch", name))
+        )
     for name in ids[:2]:
         right = (f"anchor range scale {name}", f"anchor hardly used {name}")
-        made.append(Kind(f"{name} reads a constant", _stuck(name), right))
+        made.append(Kind(f"{name} reads a constant", partial(_stuck, name), right))
         right = (
             f"anchor's outliers {name}",
             f"anchor hardly used {name}",
             f"anchor bias {name}",
         )
-        made.append(Kind(f"{name} mostly blocked", _blocked(name), right))
+        made.append(Kind(f"{name} mostly blocked", partial(_blocked, name), right))
     for axis, letter in enumerate("xyz"):
         right = ("lever arm", "lever arm's axes")
-        made.append(Kind(f"lever arm {letter}", _lever(axis), right, ("lever arm", "")))
+        made.append(Kind(f"lever arm {letter}", partial(_lever, axis), right, ("lever arm", "")))
     made += [
         Kind("lever arm forgotten", _lever_forgotten, ("lever arm", "lever arm's axes")),
-        Kind("lever arm's sign", _lever_turned(-np.eye(3)), ("lever arm's axes", "lever arm")),
-        Kind("lever arm as x forward", _lever_turned(X_FORWARD), ("lever arm's axes", "lever arm")),
-        Kind("lever arm as z up", _lever_turned(Z_UP), ("lever arm's axes", "lever arm")),
-        Kind("lever arm ten times as long", _lever_turned(10 * np.eye(3)), ("lever arm",)),
+        Kind("lever arm's sign", partial(_lever_turned, -np.eye(3)), ("lever arm's axes", "lever arm")),
+        Kind("lever arm as x forward", partial(_lever_turned, X_FORWARD), ("lever arm's axes", "lever arm")),
+        Kind("lever arm as z up", partial(_lever_turned, Z_UP), ("lever arm's axes", "lever arm")),
+        Kind("lever arm ten times as long", partial(_lever_turned, 10 * np.eye(3)), ("lever arm",)),
         Kind("tag slips", _tag_slips, ("tag slipped",), ("tag slipped", "")),
-        Kind("lever arm as y up", _lever_turned(np.diag([1.0, -1, -1])), ("lever arm's axes", "lever arm")),
-        Kind("clock off", _clock(1), ("clock offset",), ("clock offset", "")),
-        Kind("clock off, early", _clock(-1), ("clock offset",), ("clock offset", "")),
+        Kind("lever arm as y up", partial(_lever_turned, np.diag([1.0, -1, -1])), ("lever arm's axes", "lever arm")),
+        Kind("clock off", partial(_clock, 1), ("clock offset",), ("clock offset", "")),
+        Kind("clock off, early", partial(_clock, -1), ("clock offset",), ("clock offset", "")),
         Kind("clock drifts", _clock_drift, ("clock drift", "clock jump"), ("clock drift", "")),
         Kind("clock jumps", _clock_jump, ("clock jump", "clock drift"), ("clock jump", "")),
         Kind("times in whole seconds", _whole_seconds, ("clock offset",)),
@@ -109,12 +114,12 @@ def kinds(ids: list[str]) -> list[Kind]:
         Kind("map breaks", _map_breaks, ("map break",), ("map break", "")),
         Kind("radio warms up", _warming, ("radio drift",), ("radio drift", "")),
         Kind("surveyor in between", _body, ("behind the camera",), ("behind the camera", "")),
-        Kind("all step", _step(None, 0.5), ("step",), ("step", "")),
-        Kind("all step early", _step(None, 0.25), ("step", "stretch"), ("step", "")),
-        Kind("all blocked for a while", _stretch(None, 0.4), ("stretch", "step"), ("stretch", "")),
+        Kind("all step", partial(_step, None, 0.5), ("step",), ("step", "")),
+        Kind("all step early", partial(_step, None, 0.25), ("step", "stretch"), ("step", "")),
+        Kind("all blocked for a while", partial(_stretch, None, 0.4), ("stretch", "step"), ("stretch", "")),
         Kind("common bias", _common, ("common bias",), ("common bias", "")),
-        Kind("half of the ranges long", _long_share(0.5), ("range noise", "common bias", "anchor's outliers")),
-        Kind("70 % of the ranges long", _long_share(0.7), ("range noise", "common bias", "anchor's outliers")),
+        Kind("half of the ranges long", partial(_long_share, 0.5), ("range noise", "common bias", "anchor's outliers")),
+        Kind("70 % of the ranges long", partial(_long_share, 0.7), ("range noise", "common bias", "anchor's outliers")),
         Kind("noise of half a metre", _noisy, ("range noise",)),
     ]  # fmt: skip
     if ids:
@@ -124,123 +129,90 @@ def kinds(ids: list[str]) -> list[Kind]:
         made += [
             Kind("ranges long by a share", _range_share, pair, ("range scale", "")),
             Kind("anchors too small by a share", _anchor_share, pair, ("anchors' scale", "")),
-            Kind("ranges in feet", _ranges_times(1 / 0.3048), ("anchors' unit", *pair)),
-            Kind("ranges of both ways", _ranges_times(2.0), ("anchors' unit", *pair)),
-            Kind("two anchors typed wrong", _two_places(ids), places, ("anchor place", ids[1])),
-            Kind("a decimal point lost", _coordinate(ids[-1], 0, 10.0), places[-2:]),
-            Kind("a sign lost", _coordinate(ids[-1], 1, -1.0), places[-2:]),
+            Kind("ranges in feet", partial(_ranges_times, 1 / 0.3048), ("anchors' unit", *pair)),
+            Kind("ranges of both ways", partial(_ranges_times, 2.0), ("anchors' unit", *pair)),
+            Kind("two anchors typed wrong", partial(_two_places, ids), places, ("anchor place", ids[1])),
+            Kind("a decimal point lost", partial(_coordinate, ids[-1], 0, 10.0), places[-2:]),
+            Kind("a sign lost", partial(_coordinate, ids[-1], 1, -1.0), places[-2:]),
             Kind("lines of the anchors' file one off", _rotated, ("lines shifted",)),
-            Kind(f"a third of {ids[0]} is of {ids[1]}", _taken_for(ids[0], ids[1]), mixed),
-            Kind("y and z swapped", _axes(np.eye(3)[[0, 2, 1]]), ("anchors' axes",)),
+            Kind(f"a third of {ids[0]} is of {ids[1]}", partial(_taken_for, ids[0], ids[1]), mixed),
+            Kind("y and z swapped", partial(_axes, np.eye(3)[[0, 2, 1]]), ("anchors' axes",)),
             Kind("anchors in feet", _feet, ("anchors' unit", *pair)),
-            Kind("x and y swapped", _axes(np.eye(3)[[1, 0, 2]]), ("anchors' axes",)),
-            Kind("heights as depths", _axes(np.diag([1.0, 1, -1])), ("anchors' axes",)),
-            Kind("x mirrored", _axes(np.diag([-1.0, 1, 1])), ("anchors' axes",)),
-            Kind("heights never measured", _axes(np.diag([1.0, 1, 0])), ("anchor heights",)),
+            Kind("x and y swapped", partial(_axes, np.eye(3)[[1, 0, 2]]), ("anchors' axes",)),
+            Kind("heights as depths", partial(_axes, np.diag([1.0, 1, -1])), ("anchors' axes",)),
+            Kind("x mirrored", partial(_axes, np.diag([-1.0, 1, 1])), ("anchors' axes",)),
+            Kind("heights never measured", partial(_axes, np.diag([1.0, 1, 0])), ("anchor heights",)),
         ]
         for first, second in ((0, 1), (1, 2), (0, 2)):
             names = ", ".join(sorted((ids[first], ids[second]), key=sorted(ids).index))
-            made.append(Kind(f"labels {names}", _swap(ids[first], ids[second]), (f"labels swapped {names}",)))
+            made.append(Kind(f"labels {names}", partial(_swap, ids[first], ids[second]), (f"labels swapped {names}",)))
     return made
 
 
-def _place(name: str, axis: int) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.anchors_m[name] = given.anchors_m[name] + rng.choice([-1, 1]) * size * np.eye(3)[axis]
-
-    return make
+def _place(name: str, axis: int, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.anchors_m[name] = given.anchors_m[name] + rng.choice([-1, 1]) * size * np.eye(3)[axis]
 
 
-def _bias(name: str, sign: int = 1) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.range_m = given.range_m + sign * size * given.is_of(name)
-
-    return make
+def _bias(name: str, sign: int, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.range_m = given.range_m + sign * size * given.is_of(name)
 
 
 def _common(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m + size
 
 
-def _moved(name: str, share: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        direction = rng.normal(size=3) * [1, 1, 0.3]
-        at = given.true_anchors_m[name]
-        to = at + size * direction / np.linalg.norm(direction)
-        after = given.is_of(name) & (given.time_s > np.quantile(given.time_s, share))
-        grown = np.linalg.norm(given.tags_m - to, axis=1) - np.linalg.norm(given.tags_m - at, axis=1)
-        given.range_m = given.range_m + np.where(after, grown, 0.0)
-
-    return make
+def _moved(name: str, share: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    direction = rng.normal(size=3) * [1, 1, 0.3]
+    at = given.true_anchors_m[name]
+    to = at + size * direction / np.linalg.norm(direction)
+    after = given.is_of(name) & (given.time_s > np.quantile(given.time_s, share))
+    grown = np.linalg.norm(given.tags_m - to, axis=1) - np.linalg.norm(given.tags_m - at, axis=1)
+    given.range_m = given.range_m + np.where(after, grown, 0.0)
 
 
-def _step(name: str | None, share: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
-        given.range_m = given.range_m + size * (is_of & (given.time_s > np.quantile(given.time_s, share)))
-
-    return make
+def _step(name: str | None, share: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
+    given.range_m = given.range_m + size * (is_of & (given.time_s > np.quantile(given.time_s, share)))
 
 
-def _stretch(name: str | None, share: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
-        low, high = np.quantile(given.time_s, [share, share + 0.15])
-        given.range_m = given.range_m + size * (is_of & (given.time_s > low) & (given.time_s < high))
-
-    return make
+def _stretch(name: str | None, share: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
+    low, high = np.quantile(given.time_s, [share, share + 0.15])
+    given.range_m = given.range_m + size * (is_of & (given.time_s > low) & (given.time_s < high))
 
 
-def _stuck(name: str) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.range_m = np.where(given.is_of(name), np.median(given.range_m[given.is_of(name)]), given.range_m)
-
-    return make
+def _stuck(name: str, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.range_m = np.where(given.is_of(name), np.median(given.range_m[given.is_of(name)]), given.range_m)
 
 
-def _blocked(name: str) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        is_long = given.is_of(name) & (rng.random(len(given.time_s)) < 0.7)
-        given.range_m = given.range_m + is_long * rng.exponential(1.5, len(given.time_s))
-
-    return make
+def _blocked(name: str, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    is_long = given.is_of(name) & (rng.random(len(given.time_s)) < 0.7)
+    given.range_m = given.range_m + is_long * rng.exponential(1.5, len(given.time_s))
 
 
-def _long_share(share: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        is_long = rng.random(len(given.time_s)) < share
-        given.range_m = given.range_m + is_long * rng.exponential(1.0, len(given.time_s))
-
-    return make
+def _long_share(share: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    is_long = rng.random(len(given.time_s)) < share
+    given.range_m = given.range_m + is_long * rng.exponential(1.0, len(given.time_s))
 
 
 def _noisy(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m + 0.5 * rng.standard_normal(len(given.time_s))
 
 
-def _lever(axis: int) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.tag_in_cam_m = given.tag_in_cam_m + rng.choice([-1, 1]) * size * np.eye(3)[axis]
-
-    return make
+def _lever(axis: int, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.tag_in_cam_m = given.tag_in_cam_m + rng.choice([-1, 1]) * size * np.eye(3)[axis]
 
 
 def _lever_forgotten(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.tag_in_cam_m = np.zeros(3)
 
 
-def _lever_turned(axes: Array) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.tag_in_cam_m = axes @ given.tag_in_cam_m
-
-    return make
+def _lever_turned(axes: Array, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.tag_in_cam_m = axes @ given.tag_in_cam_m
 
 
-def _clock(sign: int) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.time_offset_s = given.time_offset_s + sign * size
-
-    return make
+def _clock(sign: int, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.time_offset_s = given.time_offset_s + sign * size
 
 
 def _clock_drift(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
@@ -295,28 +267,19 @@ def _reversed(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.time_s = given.time_s.min() + given.time_s.max() - given.time_s
 
 
-def _ranges_times(factor: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.range_m = given.range_m * factor
-
-    return make
+def _ranges_times(factor: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.range_m = given.range_m * factor
 
 
-def _two_places(ids: Sequence[str]) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        for name, axis in ((ids[1], 0), (ids[2], 1)):
-            _place(name, axis)(given, size, rng)
-
-    return make
+def _two_places(ids: Sequence[str], given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    for name, axis in ((ids[1], 0), (ids[2], 1)):
+        _place(name, axis, given, size, rng)
 
 
-def _coordinate(name: str, axis: int, factor: float) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        at = given.anchors_m[name].copy()
-        at[axis] *= factor
-        given.anchors_m[name] = at
-
-    return make
+def _coordinate(name: str, axis: int, factor: float, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    at = given.anchors_m[name].copy()
+    at[axis] *= factor
+    given.anchors_m[name] = at
 
 
 def _rotated(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
@@ -324,14 +287,11 @@ def _rotated(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
 
 
-def _taken_for(name: str, other: str) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        rows = np.flatnonzero(given.is_of(name) & (rng.random(len(given.time_s)) < 1 / 3))
-        true = given.true_anchors_m
-        longer = [np.linalg.norm(given.tags_m[rows] - true[each], axis=1) for each in (other, name)]
-        given.range_m[rows] += longer[0] - longer[1]
-
-    return make
+def _taken_for(name: str, other: str, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    rows = np.flatnonzero(given.is_of(name) & (rng.random(len(given.time_s)) < 1 / 3))
+    true = given.true_anchors_m
+    longer = [np.linalg.norm(given.tags_m[rows] - true[each], axis=1) for each in (other, name)]
+    given.range_m[rows] += longer[0] - longer[1]
 
 
 def _range_share(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
@@ -346,39 +306,25 @@ def _feet(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.anchors_m = {name: at / 0.3048 for name, at in given.anchors_m.items()}
 
 
-def _axes(axes: Array) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        given.anchors_m = {name: axes @ at for name, at in given.anchors_m.items()}
-
-    return make
+def _axes(axes: Array, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    given.anchors_m = {name: axes @ at for name, at in given.anchors_m.items()}
 
 
-def _swap(first: str, second: str) -> Mistake:
-    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
-        anchors = given.anchors_m
-        given.anchors_m = {**anchors, first: anchors[second], second: anchors[first]}
-
-    return make
+def _swap(first: str, second: str, given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
+    anchors = given.anchors_m
+    given.anchors_m = {**anchors, first: anchors[second], second: anchors[first]}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
+    parser = seeds_parser(__doc__, [""], 20)
     parser.add_argument("--report", action="store_true", help="tell what the file holds, and run nothing")
-    parser.add_argument("--num_seeds", type=int, default=20)
     parser.add_argument("--num_clean", type=int, default=67, help="of each simulated survey")
-    parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("--surveys", default="", help="only those whose name begins so")
-    parser.add_argument("--kinds", default="", help="only those whose name has this in it")
     parser.add_argument("--photos", action="store_true", help="map the hall and the yard from noisy features")
     parser.add_argument("--room", type=Path, help="folder of the real room's data")
     parser.add_argument("--model", type=Path, help="folder of the model of its photos")
     args = parser.parse_args()
-    lines = args.out.read_text(encoding="utf-8").splitlines() if args.out.exists() else []
-    done = {(line["survey"], line["kind"], line["seed"]): line for line in map(json.loads, lines)}
-    if args.report:
-        report(list(done.values()))
-        return
+    kept = KeptRuns(args.out, *RUN_NAMES)
     sites = [(site.name, site.anchor_frame, list(site.anchors_m), partial(surveyed, site)) for site in SITES]
     if args.photos:
         sites = [
@@ -387,43 +333,24 @@ def main() -> None:
             if site.anchor_frame == "site"
         ]
     if args.room:
-        sites = [
-            (
-                "room",
-                "site",
-                list(real_room(args.room, args.model, 0).anchors_m),
-                partial(real_room, args.room, args.model),
-            )
-        ]
-    with args.out.open("a", encoding="utf-8") as out:
-        for seed in range(args.seed, args.seed + max(args.num_seeds, args.num_clean)):
-            for name, frame, ids, make in sites:
-                if name.startswith(args.surveys):
-                    wanted = [
-                        (number, kind)
-                        for number, kind in enumerate(kinds(ids if frame != "unknown" else []))
-                        if args.kinds in kind.name and seed < args.seed + args.num_seeds
-                    ]
-                    for line in runs_of_seed(name, wanted, make, seed, done):
-                        out.write(json.dumps(line) + "\n")
-                        out.flush()
+        read = partial(real_room, args.room, args.model)
+        sites = [("room", "site", list(read(0).anchors_m), read)]
+    num = 0 if args.report else max(args.num_seeds, args.num_clean)
+    for seed in range(args.seed, args.seed + num):
+        is_wanted = seed < args.seed + args.num_seeds
+        for name, frame, ids, make in (site for site in sites if site[0].startswith(args.surveys)):
+            every = enumerate(kinds(ids if frame != "unknown" else []))
+            wanted = [
+                (number, kind) for number, kind in every if is_wanted and any(part in kind.name for part in args.kinds)
+            ]
+            run_seed(kept, name, wanted, make, seed)
+    report(kept.rows)
 
 
-def outcome(given: MadeSurvey, seed: int) -> Run:
-    return run(given, seed) if given.sfm is None else run_with_photos(given, seed)
-
-
-def runs_of_seed(
-    survey: str, numbered_kinds: Sequence[tuple[int, Kind]], make: Callable[[int], MadeSurvey], seed: int, done: Lines
-) -> Iterator[Line]:
-    """Yield the runs of a seed that are not done yet; a kind's number and the seed decide on the mistake's size."""
-    clean = done.get((survey, CLEAN, seed))
-    if clean is None:
-        clean = told(outcome(make(seed), seed), survey, CLEAN, seed)
-        yield clean
+def run_seed(kept: KeptRuns, survey: str, numbered_kinds: Sequence[tuple[int, Kind]], make: Make, seed: int) -> None:
+    """Run a seed without and with mistakes; a kind's number and the seed decide on the mistake's size."""
+    clean = kept.run(lambda: told(outcome(make(seed), seed)), survey=survey, kind=CLEAN, seed=seed)
     for number, kind in numbered_kinds:
-        if (survey, kind.name, seed) in done:
-            continue
         factor, size = FACTORS[(seed + number) % len(FACTORS)], 1.0
         if kind.of is not None:
             smallest = (clean["smallest"] or {}).get(" ".join(kind.of).strip())
@@ -431,19 +358,24 @@ def runs_of_seed(
                 continue
             size = factor * smallest
         given = make(seed)
-        if given.sfm is not None and kind.make is _map_breaks:  # its photos would have to break, too
-            continue
-        kind.make(given, size, np.random.default_rng([seed, 7]))
-        given.needs_search = kind.of is None
-        yield told(outcome(given, seed), survey, kind.name, seed, kind.right, factor if kind.of else None, size)
+        if not (kind.make is _map_breaks and given.sfm is not None):  # its photos would have to break, too
+            run_kind = partial(run_with_mistake, kind, given, seed, factor, size)
+            kept.run(run_kind, survey=survey, kind=kind.name, seed=seed)
 
 
-def told(
-    run_: Run, survey: str, kind: str, seed: int, right: tuple[str, ...] = (), factor: float | None = None,
-    size: float | None = None,
-) -> Line:  # fmt: skip
-    """Return the figures of a run that the report needs."""
-    line: Line = {"survey": survey, "kind": kind, "seed": seed, "factor": factor, "size": size}
+def run_with_mistake(kind: Kind, given: MadeSurvey, seed: int, factor: float, size: float) -> Line:
+    kind.make(given, size, np.random.default_rng([seed, 7]))
+    given.needs_search = kind.of is None
+    return told(outcome(given, seed), kind.right, factor if kind.of else None, size)
+
+
+def outcome(given: MadeSurvey, seed: int) -> Run:
+    return run(given, seed) if given.sfm is None else run_with_photos(given, seed)
+
+
+def told(run_: Run, right: tuple[str, ...] = (), factor: float | None = None, size: float | None = None) -> Line:
+    """Return the figures of a run that the report needs; nothing is right to name where no mistake was made."""
+    line: Line = {"factor": factor, "size": size}
     if run_.diagnosis is None or run_.estimate is None:
         return {**line, "refused": run_.refusal, "smallest": None}
     tests = run_.diagnosis.tests
@@ -470,7 +402,7 @@ def told(
         "smallest": {
             f"{t.name} {t.subject}".strip(): t.smallest_detectable
             for t in tests
-            if kind == CLEAN and np.isfinite(t.smallest_detectable)
+            if not right and np.isfinite(t.smallest_detectable)
         },
     }
 
@@ -479,40 +411,16 @@ def _is(name: str, right: tuple[str, ...]) -> bool:
     return any(name == r or name.startswith(f"{r} ") for r in right)
 
 
-@dataclass(frozen=True)
-class Tally:
-    """Counts of runs."""
-
-    num: int
-    refused: int
-    found: int
-    named: int
-    first: int
-    good: int
-    wrong_and_good: int
-    displaced_and_good: int
-
-    @classmethod
-    def of(cls, lines: Sequence[Line]) -> Tally:
-        judged = [line for line in lines if not line["refused"]]
-        good = [line for line in judged if not line["doubts"]]
-        return cls(
-            len(lines),
-            len(lines) - len(judged),
-            sum(line["found"] for line in judged),
-            sum(line["is_named"] for line in judged),
-            sum(line["is_first"] for line in judged),
-            len(good),
-            sum(line["wrong"] for line in good),
-            sum(line["place"] > 3 for line in good),
-        )
-
-    def __str__(self) -> str:
-        return (
-            f"{self.num:5} runs,{self.refused:4} refused,{self.found:5} found,{self.named:5} named,"
-            f"{self.first:5} first,{self.good:5} good, of these{self.wrong_and_good:3} outside the interval,"
-            f"{self.displaced_and_good:3} out of place"
-        )
+def counted(lines: Sequence[Line]) -> str:
+    """Return the counts of runs in words."""
+    judged = [line for line in lines if not line["refused"]]
+    good = [line for line in judged if not line["doubts"]]
+    found, named, first = (sum(line[key] for line in judged) for key in ("found", "is_named", "is_first"))
+    return (
+        f"{len(lines):5} runs,{len(lines) - len(judged):4} refused,{found:5} found,{named:5} named,"
+        f"{first:5} first,{len(good):5} good, of these{sum(line['wrong'] for line in good):3} outside the interval,"
+        f"{sum(line['place'] > 3 for line in good):3} out of place"
+    )
 
 
 def report(lines: list[Line]) -> None:
@@ -521,15 +429,15 @@ def report(lines: list[Line]) -> None:
     for survey in dict.fromkeys(line["survey"] for line in lines):
         clean = [line for line in lines if line["kind"] == CLEAN and line["survey"] == survey]
         widths = [line["half_width"] for line in clean if not line["refused"]]
-        print(f"{survey}: {'clean':34}{Tally.of(clean)}; median half width {100 * np.median(widths):.2f} %")
+        print(f"{survey}: {'clean':34}{counted(clean)}; median half width {100 * np.median(widths):.2f} %")
         for name in dict.fromkeys(line["kind"] for line in made if line["survey"] == survey):
             own = [line for line in made if (line["survey"], line["kind"]) == (survey, name)]
-            print(f"{survey}: {name:34}{Tally.of(own)}")
+            print(f"{survey}: {name:34}{counted(own)}")
     for factor in [None, *sorted(set(FACTORS))]:
         which = "of one size" if factor is None else f"of {factor} times the smallest detectable size"
-        print(f"{which:40}{Tally.of([line for line in made if line['factor'] == factor])}")
-    print(f"{'all mistakes':40}{Tally.of(made)}")
-    print(f"{'all clean':40}{Tally.of([line for line in lines if line['kind'] == CLEAN])}")
+        print(f"{which:40}{counted([line for line in made if line['factor'] == factor])}")
+    print(f"{'all mistakes':40}{counted(made)}")
+    print(f"{'all clean':40}{counted([line for line in lines if line['kind'] == CLEAN])}")
 
 
 if __name__ == "__main__":

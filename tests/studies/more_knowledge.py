@@ -21,19 +21,17 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from tests.simulated.runs import NO_RANGES
 from tests.simulated.surveys import model_of_poses
 from tests.studies import real_logs
-from tests.studies.known_positions import NO_RANGES
+from tests.studies.known_positions import antenna_track
 
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.tape import CONTROL, Tape, TapedDistance
-from rangesfm.measurements.positions.antenna_track import AntennaTrack
-from rangesfm.measurements.positions.position_log import PositionLog
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
-from rangesfm.options import RangesOptions
 from rangesfm.pipeline.run import map_in_metres
 from rangesfm.progress import Journal, Progress
 from rangesfm.survey.inputs import RangingInputs
@@ -70,8 +68,8 @@ class Measured:
         true_m = real_logs.FACTOR * path.centers
         rows = np.linspace(0, len(path) - 1, NUM_POSITIONS).round().astype(np.int64)
         at_m = true_m[rows] + POSITION_STDDEV_M * rng.standard_normal((len(rows), 3))
-        stated_m2, names = np.tile(POSITION_STDDEV_M**2 * np.eye(3), (len(rows), 1, 1)), path.image_names
-        track = PositionLog(at_m, stated_m2, ByPhoto(tuple(names[row] for row in rows)), rows)
+        names = path.image_names
+        track = antenna_track(at_m, POSITION_STDDEV_M, ByPhoto(tuple(names[row] for row in rows)))
         taped = []
         for _ in range(NUM_LENGTHS):
             first, last = (int(rng.integers(len(path) // 4)), int(rng.integers(len(path) // 2, len(path))))
@@ -79,8 +77,7 @@ class Measured:
             taped.append(TapedDistance((names[first], names[last]), float(length_m), LENGTH_STDDEV_M, CONTROL, 0))
         inputs = RangingInputs(
             observations.log, np.zeros((len(observations.log.tag_ids), 3)), tuple(case.anchors), case.frame,
-            Site(np.zeros(3)), Tape(tuple(taped)),
-            positions=SurveyedPositions(antenna=AntennaTrack(track, np.zeros(3), None, RangesOptions())),
+            Site(), Tape(tuple(taped)), positions=SurveyedPositions(antenna=track),
         )  # fmt: skip
         return cls(name, path, inputs, PathOfModel("sparse/0", model_of_poses(path), path, observations))
 

@@ -1,6 +1,6 @@
 """Check a plan's bending of the map by photos: predicted stddevs of keyframes, and the spread of refined maps.
 
-Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
+Run: python -m tests.studies.planned_bends [--out FILE] [--num_seeds 40] [--kinds NAME ...]
 
 Simulated features of known noise are mapped, scaled and refined with ranges by the stages themselves. Prints for each
 survey the predicted stddev of keyframes (root mean square over the path) for a map whose photos are not planned, and
@@ -28,7 +28,7 @@ from tests.simulated.surveys import (
     truth_of,
     yard_truth,
 )
-from tests.studies.kept_runs import Row, spread, study
+from tests.studies.kept_runs import Row, runs_of, seeds_parser, spread
 
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.errors.components import COMPONENTS
@@ -122,15 +122,14 @@ def rms(stddevs: Expected) -> float:
 
 
 def main() -> None:
-    asked = study(__doc__)
+    asked = seeds_parser(__doc__, list(SURVEYS), 40).parse_args()
     print(f"{'survey':30}{'poses':>9}{'planned':>10}{'spread':>9}{'ratio':>16}{'bend':>10}{'spread':>9}{'ratio':>16}")
-    for name, (make, seen, pixel_stddev) in SURVEYS.items():
-        if not name.startswith(asked.beginning):
-            continue
+    for name in asked.kinds:
+        make, seen, pixel_stddev = SURVEYS[name]
         survey = make()
         plan = planned(survey, seen)
         poses, expected = expect(replace(plan, photos=None)), expect(plan)
-        rows = asked.runs_of(name, partial(one_run, survey, pixel_stddev))
+        rows = runs_of(asked, name, partial(one_run, survey, pixel_stddev))
         told = [f"{name:30}{rms(poses):7.3f} m"]
         for predicted, of in ((rms(expected), "refined"), (free_bend_m(expected), "bend")):
             found, chance = spread(rows, of)

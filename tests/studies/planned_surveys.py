@@ -1,6 +1,6 @@
 """Check a plan's numbers: predicted stddevs against those that simulated runs state, and against their spread.
 
-Run: python -m tests.studies.planned_surveys --rows FILE [--num_seeds 100] [--surveys NAME]
+Run: python -m tests.studies.planned_surveys [--out FILE] [--num_seeds 100] [--kinds NAME ...]
 
 Twenty surveys of different kinds, with the radios of eight public logs and with a usual one, are planned. Then each is
 measured and its scale found again and again, every time with other errors of its radio, other errors in surveying the
@@ -13,6 +13,7 @@ all runs' errors; that of the place (of the keyframe known least) over the sprea
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -23,7 +24,8 @@ from tests.estimation.scale.conftest import lengths_among
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.radio_errors import errors_of_radio
 from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
-from tests.studies.kept_runs import Row, Study, spread, study
+from tests.studies import kept_runs
+from tests.studies.kept_runs import Row, seeds_parser, spread
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError
@@ -242,23 +244,21 @@ def worst_keyframe(expected: Expected) -> int | None:
     return None if expected.placement is None else int(np.argmax(expected.keyframe_stddevs_m))
 
 
-def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 8) -> list[Row]:
+def runs_of(asked: argparse.Namespace, name: str, planned: PlannedSurvey, num_whole: int = 8) -> list[Row]:
     """Run one survey; its first runs are whole scale stages."""
     keyframe = worst_keyframe(expect(planned))
-    return asked.runs_of(name, lambda seed: one_run(planned, keyframe, seed, is_whole=seed < num_whole))
+    return kept_runs.runs_of(asked, name, lambda seed: one_run(planned, keyframe, seed, is_whole=seed < num_whole))
 
 
 def main() -> None:
-    asked = study(__doc__)
+    asked = seeds_parser(__doc__, list(SURVEYS), 100).parse_args()
     print(
         f"{'survey':34}{'predicted':>10}{'stated':>9}{'ratio':>7}{'spread':>9}{'ratio':>14}{'place':>10}{'spread':>9}"
         f"{'ratio':>14}{'refused':>9}"
     )
     off: dict[str, list[float]] = {"stated scale": [], "scale": [], "place": []}
-    for name, plan in SURVEYS.items():
-        if not name.startswith(asked.beginning):
-            continue
-        planned = plan()
+    for name in asked.kinds:
+        planned = SURVEYS[name]()
         expected = expect(planned)
         rows = runs_of(asked, name, planned)
         scale, place_m = expected.uncertainty.empirical, expected.worst_keyframe_m

@@ -2,7 +2,7 @@
 
 Run: python -m tests.studies.real_positions --data FOLDER --model sparse/0 [--num_seeds 30] [--num_refined 3]
 
-FOLDER has photos' times and the true path (room_env1: images.csv, groundtruth.csv), and the model is of its photos
+FOLDER has photos' times, a radio and the true path (room_env1), and the model is of its photos
 (``rangesfm reconstruct``). Positions are at 1 Hz, with 0.1 m of independent noise that is not stated, of an antenna
 0.23 m from the lens; nor is the time offset stated. Each seed draws other noise.
 
@@ -15,45 +15,21 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
-from tests.studies.known_positions import NO_RANGES
-from tests.studies.real_room import interpolated, path_and_truth
+from tests.simulated.runs import inputs_of, run_stages
+from tests.studies.known_positions import antenna_track
+from tests.studies.real_room import interpolated, path_and_truth, real_room
 
-from rangesfm.measurements.lengths.tape import Tape
-from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
-from rangesfm.measurements.positions.clock import find_antenna_offset
-from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
+from rangesfm.arrays import Array
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
-from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.association import associate
-from rangesfm.options import RangesOptions
-from rangesfm.pipeline.make_metric_map import bending_by_survey
-from rangesfm.pipeline.run import map_in_metres
-from rangesfm.progress import Journal, Progress
-from rangesfm.solver.posterior import ScaleUncertainty
-from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.moments import ByTime
-from rangesfm.util.geometry.similarity import align_points
 from rangesfm.util.geometry.trajectory import Trajectory
 
-Array = npt.NDArray[np.float64]
 ANTENNA_IN_CAM_M, NOISE_M = np.array([0.1, -0.2, 0.05]), 0.1
-SETTINGS = Survey().changed({"mapper.num_threads": 1})
-
-
-def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, ScaleUncertainty]:
-    """Return the scale of the refined map, with all defaults."""
-    known = SurveyedPositions(antenna=track)
-    inputs = RangingInputs(NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), positions=known)
-    metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(Progress())), [survey_path], refine=True)
-    return metric.estimate.value, metric.estimate.uncertainty
 
 
 def true_antenna(path: Trajectory, times: Array, centers_m: Array, world_from_cam: Array) -> tuple[Array, Array]:
@@ -75,28 +51,18 @@ def main() -> int:
     asked = parser.parse_args()
     path, times, centers_m, rotations = path_and_truth(asked.data, asked.model)
     at_s, at_m = true_antenna(path, times, centers_m, rotations(times).as_matrix())
-    true_m = interpolated(times, centers_m, path.times_s)
-    is_known = np.isfinite(true_m).all(axis=1)
-    true_scale = align_points(path.centers[is_known], true_m[is_known]).scale
-    model = pycolmap.Reconstruction(asked.model)
-    whole = PathOfModel("sparse/0", model, path, associate(NO_RANGES, path, np.zeros((0, 3))))
-    bending, lines = bending_by_survey(SETTINGS, whole), []
-
-    def told(name: str, value: float, uncertainty: ScaleUncertainty) -> None:
-        (low, high), off = uncertainty.interval_95, float(np.log(true_scale / value))
-        print(f"{name}: error {-100 * off:+.2f} %, interval {-100 * high:+.2f} to {-100 * low:+.2f} %", flush=True)
-        lines.append((name, off, low <= off <= high))
-
+    survey = replace(real_room(asked.data, asked.model, 0), sfm=pycolmap.Reconstruction(asked.model))
+    lines = []
     for seed in range(asked.num_seeds):
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(at_m.shape)
-        log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), ByTime(at_s), np.arange(len(at_s)))
-        track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
-        timed = find_antenna_offset(track, path)
-        known = locate_antenna(timed, path)
-        found = scale_by_positions(PositionScale.begun(known, bending, SurveyedPositions(antenna=timed)))
-        told("scaled", found.alone.scale.value, found.alone.posterior.uncertainty)
-        if seed < asked.num_refined:
-            told("refined", *refined(whole, track))
+        track = antenna_track(at_m + noise_m, np.nan, ByTime(at_s), ANTENNA_IN_CAM_M)
+        inputs = inputs_of(None, positions=SurveyedPositions(antenna=track))
+        for name in ("scaled", "refined")[: 1 + (seed < asked.num_refined)]:
+            metric = run_stages(survey, 0, inputs, intrinsics_are_known=False, is_refined=name == "refined")
+            low, high = metric.estimate.uncertainty.interval_95
+            off = float(np.log(survey.metres_per_unit / metric.estimate.value))
+            print(f"{name}: error {-100 * off:+.2f} %, interval {-100 * high:+.2f} to {-100 * low:+.2f} %", flush=True)
+            lines.append((name, off, low <= off <= high))
     bound = NOISE_M / np.linalg.norm(at_m - at_m.mean(axis=0))
     for wanted in ("scaled", "refined"):
         errors, covered = (np.array([line[k] for line in lines if line[0] == wanted]) for k in (1, 2))
