@@ -6,6 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 from PIL.ExifTags import IFD, Base
+from tests.simulated.files import write_rows
 
 
 def write_photos(folder: Path, num: int, *, num_upright: int = 0, has_times: bool = True) -> None:
@@ -21,10 +22,9 @@ def write_photos(folder: Path, num: int, *, num_upright: int = 0, has_times: boo
 
 def write_log(path: Path, start_s: float, *, anchors: tuple[str, ...] = ("A1", "A2", "A3", "A4")) -> None:
     """Write a log of ranges twice a second, to one anchor after the other."""
-    rows = [f"{start_s + 0.5 * k},{anchors[k % len(anchors)]},{3 + 0.01 * k:.2f}" for k in range(60)]
-    path.write_text("timestamp_s,anchor_id,range_m\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    rows = ((start_s + 0.5 * k, anchors[k % len(anchors)], f"{3 + 0.01 * k:.2f}") for k in range(60))
+    write_rows(path, "timestamp_s,anchor_id,range_m", rows)
 
 
 def write_anchors(path: Path) -> None:
-    rows = [f"A{k},{5 * (k % 2)},{4 * (k // 3)},{0.5 * k}" for k in range(1, 5)]
-    path.write_text("anchor_id,x_m,y_m,z_m\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    write_rows(path, "anchor_id,x_m,y_m,z_m", ((f"A{k}", 5 * (k % 2), 4 * (k // 3), 0.5 * k) for k in range(1, 5)))
