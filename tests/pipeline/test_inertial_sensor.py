@@ -87,7 +87,9 @@ def test_photos_and_a_sensor_make_a_metric_and_level_map(alone: Path) -> None:
     assert imu["up_stddev_deg"] < 0.5
     again = expect(plan_of_result(alone))  # its map bends as usual, which is more than this one
     assert half_width(result) < again.uncertainty.half_width_95 < 3 * half_width(result)
-    assert "samples of an inertial sensor give it metres" in (alone / "report.html").read_text("utf-8")
+    report = (alone / "report.html").read_text("utf-8")
+    assert "samples of an inertial sensor give it metres" in report
+    assert "noise of the accelerometer, m/s² per √Hz" in report
 
 
 def test_beside_ranges_it_makes_the_interval_narrower(

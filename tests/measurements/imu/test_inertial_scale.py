@@ -17,7 +17,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.estimation.photo_bending import bending_of_model
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
-from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.log import ImuLog, clipped_samples
 from rangesfm.measurements.imu.motion import Mounting
 from rangesfm.measurements.imu.sensor_prior import SensorPrior
 from rangesfm.options import CameraOptions, RefineOptions
@@ -135,15 +135,20 @@ def test_a_log_of_another_day_is_refused() -> None:
         scale_by_sensor(replace(problem, log=later))
 
 
+def clipped_at(log: ImuLog, most_m_s2: float) -> ImuLog:
+    accel_m_s2 = np.clip(log.accel_m_s2, -most_m_s2, most_m_s2)
+    return replace(log, accel_m_s2=accel_m_s2, clipped=clipped_samples(log.gyro_rad_s, accel_m_s2))
+
+
 def test_a_stretch_at_the_end_of_an_accelerometers_scale_is_left_out() -> None:
     """A fifth of the samples is clipped, at a value that no data sheet has."""
     problem = posed(by_hand(5, axes=(3.0, 3.0, 3.0)), np.zeros(3))
     log = problem.log
     most = float(np.quantile(np.abs(log.accel_m_s2).max(axis=1), 0.8))
-    clipped = replace(log, accel_m_s2=np.clip(log.accel_m_s2, -most, most))
+    clipped = clipped_at(log, most)
     assert np.mean(clipped.clipped[:, 1]) == pytest.approx(0.2, abs=0.01)
     assert not clipped.clipped[:, 0].any()
-    assert not log.clipped.any()
+    assert not clipped_at(log, 2 * np.abs(log.accel_m_s2).max()).clipped.any()
     whole, found = (scale_by_sensor(replace(problem, log=each)) for each in (log, clipped))
     assert len(found.intervals) < len(whole.intervals)
     off = [float(np.log(each.alone.scale.value / METRES_PER_UNIT)) for each in (whole, found)]
@@ -153,6 +158,6 @@ def test_a_stretch_at_the_end_of_an_accelerometers_scale_is_left_out() -> None:
 
 def test_a_sensor_that_is_at_the_end_of_its_scale_between_all_photos_tells_nothing() -> None:
     problem = posed(by_hand(5), np.zeros(3))
-    clipped = replace(problem.log, accel_m_s2=np.clip(problem.log.accel_m_s2, -1.0, 1.0))
+    clipped = clipped_at(problem.log, 1.0)
     with pytest.raises(GeometryError, match="at the end of its scale between all photos"):
         scale_by_sensor(replace(problem, log=clipped))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -42,6 +43,21 @@ class ImuEntry(KindEntry):
     gyro_bias_rad_s: Vector
     accel_noise: NumberOrNull
     gyro_noise: NumberOrNull
+
+    caption: ClassVar[str] = "Inertial sensor"
+    meanings: ClassVar[Mapping[str, str]] = {
+        "num": "samples in the log",
+        "num_used": "between the photos",
+        "time_offset": "time offset, and its standard deviation, s",
+        "rotation_imu_to_cam_xyzw": "rotation from the sensor's axes to the camera's, as a quaternion x, y, z, w",
+        "gravity_in_world": "gravity in the map, m/s²",
+        "up_stddev_deg": "standard deviation of its direction, degrees",
+        "accel_scale_factors": "scale factors of the accelerometer's axes, 1: right",
+        "accel_bias_m_s2": "zero of the accelerometer, m/s²",
+        "gyro_bias_rad_s": "zero of the gyroscope, rad/s",
+        "accel_noise": "noise of the accelerometer, m/s² per √Hz",
+        "gyro_noise": "noise of the gyroscope, rad/s per √Hz",
+    }
 
     def lines(self) -> Iterator[str]:
         """Yield how many samples are used, and how well they tell what is up."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
-from rangesfm.measurements.imu.log import STANDARD_GRAVITY_M_S2, ImuLog, times_of_sampling
+from rangesfm.measurements.imu.log import STANDARD_GRAVITY_M_S2, ImuLog, clipped_samples, times_of_sampling
 from rangesfm.measurements.imu.signals import (
     ACCEL,
     GRAVITY,
@@ -437,6 +437,7 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
         raise InputError("gyroscope and accelerometer were not recorded at the same time", path)
     times_s = gyro.times_s[known]
     log = ImuLog(times_s, gyro.values[known], _at(accel, times_s), str(path))
+    log = replace(log, clipped=clipped_samples(log.gyro_rad_s, log.accel_m_s2))
     if (fastest := float(np.abs(log.gyro_rad_s).max())) > _FASTEST_RAD_S:
         most = f"at most {np.degrees(_FASTEST_RAD_S):.0f} in any axis"
         raise InputError(f"a rate is {np.degrees(fastest):.3g} deg/s, expected {most}", gyro.path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -95,6 +95,8 @@ class ImuLog:
         noise: as a file states it; None if none does.
         notes: assumptions made in reading the file, as lines for the user.
         doubts: what is not as it should be, as lines for the user: gaps, few samples, values at the end of the scale.
+        clipped: (k, 2) whether gyroscope and accelerometer were at the end of their scale in any axis; (0, 2) if they
+            have none, as those of a plan.
     """
 
     timestamp_s: Array
@@ -104,6 +106,7 @@ class ImuLog:
     noise: ImuNoise | None = None
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    clipped: Mask = field(default_factory=lambda: np.zeros((0, 2), dtype=bool))
 
     def __post_init__(self) -> None:
         num = len(self.timestamp_s)
@@ -122,18 +125,12 @@ class ImuLog:
         """Name of the file, for messages."""
         return Path(self.path).name or "the inertial sensor"
 
-    @cached_property
-    def clipped(self) -> Mask:
-        """(k, 2) whether gyroscope and accelerometer were at the end of their scale in any axis at each sample."""
-        scales = (self.gyro_rad_s, _FULL_SCALES_RAD_S), (self.accel_m_s2, _FULL_SCALES_M_S2)
-        return np.column_stack([_is_clipped(values, full_scales) for values, full_scales in scales])
-
     def is_clipped_between(self, from_s: Array, to_s: Array) -> Mask:
         """Return whether a sensor was at the end of its scale between two times (n,) each, or right before or after."""
         before = np.cumsum(np.append(0, self.clipped.any(axis=1)))
         first = np.searchsorted(self.timestamp_s, from_s, side="right") - 1
         last = np.searchsorted(self.timestamp_s, to_s, side="left")
-        num = len(self)
+        num = len(self.clipped)
         return np.asarray(before[np.clip(last + 1, 0, num)] > before[np.clip(first, 0, num)])
 
     @property
@@ -221,6 +218,12 @@ class ImuLog:
         seconds = fraction * (self.timestamp_s[before + 1] - self.timestamp_s[before])
         middle = self._at_samples[before] * Rotation.from_rotvec(0.5 * fraction[:, None] * self._steps[before])
         return np.asarray(self._summed[before] + middle.as_matrix() * seconds[:, None, None])
+
+
+def clipped_samples(gyro_rad_s: Array, accel_m_s2: Array) -> Mask:
+    """Return (k, 2) whether gyroscope and accelerometer were at the end of their scale in any axis at each sample."""
+    scales = (gyro_rad_s, _FULL_SCALES_RAD_S), (accel_m_s2, _FULL_SCALES_M_S2)
+    return np.column_stack([_is_clipped(values, full_scales) for values, full_scales in scales])
 
 
 def _is_clipped(values: Array, full_scales: Array) -> Mask:
