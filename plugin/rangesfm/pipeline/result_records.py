@@ -19,7 +19,7 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
-from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
+from rangesfm.measurements.lengths.tape import CHECK, CONTROL
 from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.positions.control_points import locate_points
 from rangesfm.measurements.positions.entry import PointErrors3d, PointRow, PointsEntry
@@ -252,19 +252,18 @@ def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
 
 
 def disagreements(rows: Iterable[entries.DistanceRow], relative_scale_stddev: float) -> Iterator[Doubt]:
-    """Yield a doubt for each length that differs from the map by more than tape, scale and bending explain.
+    """Yield a doubt for each check length that differs from the map by more than tape, scale and bending explain.
 
-    For a control length the uncertainty of the scale is not counted, because it has taken part in the scale.
+    A control length is tested as an observation of the map, whose bending is known better there (``MistakeTests``).
 
     Args:
         relative_scale_stddev: relative standard deviation of the scale.
     """
     for row in rows:
-        of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
-        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, BENDING * row.measured_m)
-        if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
+        stddev_m = math.hypot(row.stddev_m, relative_scale_stddev * row.measured_m, BENDING * row.measured_m)
+        if row.kind == CHECK and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
             yield Doubt(
-                f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
+                f"check distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
                 f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
                 f"{_DISAGREES * stddev_m:.3f} m)"
             )
