@@ -87,6 +87,7 @@ class Key:
         role: of a path, what kind of file or folder it leads to.
         is_key: whether users may write it into the survey file.
         is_common: whether most people need it, so that the short help of a command has its flag.
+        metres: in words, what gives a map its metres where the key has a value; empty if nothing does.
         table, name: its place.
         type: of the value, without the None that means "not given".
         meaning: the docstring on one line without its full stop, followed by the default.
@@ -98,6 +99,7 @@ class Key:
     role: PathRole | None = None
     is_key: bool = True
     is_common: bool = False
+    metres: str = ""
     table: str = ""
     name: str = ""
     type: Any = Any

@@ -215,7 +215,9 @@ class RangeModelOptions(Options, table="ranges"):
 class RangesOptions(RangeModelOptions):
     """The radio's log, how its ranges are placed on the path, assumptions about its errors, and checks."""
 
-    path: Annotated[Path | None, Key(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
+    path: Annotated[
+        Path | None, Key(flag="ranges", metavar="LOG", role="log", is_common=True, metres="a radio's log")
+    ] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
     format: Annotated[str, Key(flag="ranges_format")] = ""
     """Format of the log (default: recognised by content)."""
@@ -296,7 +298,7 @@ class AnchorOptions(Options, table="anchors"):
 class PointOptions(Options, table="points"):
     """Marks in the photos whose coordinates are known: control points and check points."""
 
-    path: Annotated[Path | None, Key(flag="points", role="file", is_common=True)] = None
+    path: Annotated[Path | None, Key(flag="points", role="file", is_common=True, metres="control points")] = None
     """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, ODM's
     gcp_list.txt, or Metashape's markers (XML). A control point determines the map, a check point is only compared with
     it. The photos that show them are in that file, in that of [scale] markers, or found (printed tags)."""
@@ -316,7 +318,7 @@ class PointOptions(Options, table="points"):
 class PositionOptions(Options, table="positions"):
     """Positions of an antenna on the camera: by satellites, by a radio that hands out positions, or a total station."""
 
-    path: Annotated[Path | None, Key(flag="positions", role="file_or_photos")] = None
+    path: Annotated[Path | None, Key(flag="positions", role="file_or_photos", metres="positions")] = None
     """CSV timestamp_s,x_m,y_m,z_m[,stddev_m] (or image_name in place of timestamp_s; stddev_x_m, stddev_y_m and
     stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
     of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors; or the folder of photos, for
@@ -361,7 +363,9 @@ class PositionOptions(Options, table="positions"):
 class ImuOptions(Options, table="imu"):
     """The log of an inertial sensor (IMU) that is fixed to the camera: of a phone, an action camera or a rig."""
 
-    path: Annotated[Path | None, Key(flag="imu", metavar="PATH", role="log")] = None
+    path: Annotated[
+        Path | None, Key(flag="imu", metavar="PATH", role="log", metres="the log of an inertial sensor")
+    ] = None
     """CSV timestamp_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2, another table with
     the rates and accelerations of three axes, the folder or zip archive of a phone's recording, or a ROS bag."""
     rotation_imu_to_cam_xyzw: Annotated[
@@ -438,7 +442,7 @@ class ScaleOptions(Options, table="scale"):
     adopt: bool = False
     """Run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown, the lever
     arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
-    distances: Annotated[Path | None, Key(role="file", is_common=True)] = None
+    distances: Annotated[Path | None, Key(role="file", is_common=True, metres="taped distances")] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
     markers: Annotated[Path | None, Key(role="file")] = None
     """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped, or
@@ -451,7 +455,7 @@ class MarkerOptions(Options, table="markers"):
     dictionary: Annotated[TagDictionary | None, Key(flag="marker_dictionary", metavar="NAME")] = None
     """Dictionary of the printed tags, by OpenCV's name. The corners of tag 7 are the markers tag7.0 (upper left of the
     upright tag) to tag7.3, clockwise (default: no tags are looked for)."""
-    side_m: Annotated[_Positive | None, Key(flag="marker_side_m")] = None
+    side_m: Annotated[_Positive | None, Key(flag="marker_side_m", metres="the size of printed tags")] = None
     """Side of the tags, from black corner to black corner. Each tag found gives four known lengths (default: none; the
     corners only serve as ends of taped distances)."""
     side_stddev_m: Annotated[_Positive, Key(flag="marker_side_stddev_m")] = 0.0005

@@ -65,7 +65,7 @@ def test_init_says_what_is_missing_and_assumed(folder: Path, capsys: pytest.Capt
     (folder / "uwb.csv").unlink()
     assert main(["init", str(folder)]) == 0
     told = capsys.readouterr().out
-    assert "\nmissing: no ranges and no lengths: give a radio's log (--ranges LOG), taped distances" in told
+    assert "\nmissing: no ranges and no lengths: give a radio's log (--ranges), control points (--points)" in told
     assert "\nnext: write down what is missing (a flag is a key of the same name), then " in told
     assert told.endswith(f"rangesfm check '{folder}/survey.toml'\n")
     assert main(["check", str(folder)]) == 2

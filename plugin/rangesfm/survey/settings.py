@@ -33,9 +33,6 @@ from rangesfm.options import (
     TagOptions,
 )
 
-METRIC_KEYS = ("ranges.path", "scale.distances", "markers.side_m", "points.path", "positions.path", "imu.path")
-"""Keys of the measurements from which the map gets its metres."""
-
 
 @dataclass(frozen=True)
 class OptionsOrigin:
@@ -170,11 +167,9 @@ class Survey(BaseModel):
                 "between their corners (--distances CSV)"
             )
         if not self.metric_keys and self.images.rig_config is None:
+            known = ", ".join(f"{key.metres} (--{key.flag})" for key in KEYS if key.metres)
             raise InputError(
-                "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
-                "control points (--points CSV), positions (--positions FILE), the size of printed tags "
-                "(--marker_side_m), the log of an inertial sensor (--imu LOG), or a rig with known poses "
-                "(--rig_config_path JSON)"
+                f"no ranges and no lengths: give {known}, or a rig with known poses (--rig_config_path JSON)"
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -193,6 +188,8 @@ KEYS = tuple(
     for model in SURVEY_TABLES.values()
     for item in sorted(model.keys().values(), key=lambda item: item.role is None)
 )
+METRIC_KEYS = tuple(item.dotted for item in KEYS if item.metres)
+"""Dotted keys of the measurements from which the map gets its metres."""
 ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if item.role is not None}
 """Kind of file or folder by dotted key, of the keys whose values are paths."""
 

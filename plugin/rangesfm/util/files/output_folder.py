@@ -298,7 +298,7 @@ def _acquire(lock: BaseFileLock, folder: Path, private: Path, max_wait_s: float)
     from filelock import Timeout
 
     try:
-        private.mkdir(exist_ok=True)
+        private.mkdir(parents=True, exist_ok=True)  # the parent may just have been removed
     except OSError as error:
         raise InputError("exists, expected rangesfm's own folder or nothing here", private) from error
     if private.is_symlink():
