@@ -17,14 +17,13 @@ import pycolmap
 from rangesfm.errors import InputError, printable
 from rangesfm.util.files.text_tables import read_text, repeated
 
+_MODELS = {name: int(model) for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 NUM_CAMERA_PARAMS = {
-    int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
-    for name, model in pycolmap.CameraModelId.__members__.items()
-    if name != "INVALID"
+    model: len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
+    for model in _MODELS.values()
 }
 """Number of parameters by camera model."""
 
-_MODELS = {name: int(model) for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 _STEMS = ("cameras", "rigs", "frames", "images", "points3D")
 _MARKS = (b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff")
 _CAMERA, _RIG, _FRAME, _IMAGE, _POINT = _STEMS

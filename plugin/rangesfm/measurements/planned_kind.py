@@ -25,7 +25,7 @@ class PlannedKind(Options):
         """Return a plan of the same measurements as those of a result.
 
         Args:
-            learnt: sizes of errors that a run has learnt, by their names in ``result.json``.
+            learnt: all numbers with fractions of its entry in ``result.json``, by their keys there.
         """
         del learnt
         return cls()

@@ -50,8 +50,9 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     # A lens that does not fit comes first, because it may look like other mistakes.
     of_lens = _doubts_of_lens(metric)
     of_lengths = tuple(disagreements(distance_rows(metric), metric.estimate.uncertainty.empirical))
-    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *metric.rivals.doubts)
-    journal.warn(*(doubt.reason for doubt in of_lengths))
+    journal.warn(
+        *(doubt.reason for doubt in (*of_lens, *doubts)), *metric.rivals.doubts, *(doubt.reason for doubt in of_lengths)
+    )
     doubts += known_doubts
     of_map = [doubt.reason for doubt in doubts]
     against = (*(doubt.reason for doubt in of_lens), *diagnosis.of_place, *metric.rivals.doubts, *of_map)

@@ -41,7 +41,6 @@ CANONICAL_COLUMNS = (
     *(f"accel_{axis}_m_s2" for axis in "xyz"),
 )
 _EXPECTED = f"expected a table with {','.join(CANONICAL_COLUMNS)}, or the log of a phone"
-"""Acceleration that is called 1 g (ISO 80000-3)."""
 # Median length of the acceleration of what is carried, with gravity: within a third of it.
 _WITH_GRAVITY = (0.67, 1.5)
 # Share by which the lengths of most accelerations differ, at most, where gravity is in them.

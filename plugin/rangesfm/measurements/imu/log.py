@@ -19,6 +19,7 @@ _LATE = 0.25
 # Steps that differ more than this from their median, in steps, are not those of a sensor's own clock.
 _UNEVEN = 0.25
 STANDARD_GRAVITY_M_S2 = 9.80665
+"""Acceleration that is called 1 g (ISO 80000-3)."""
 # Full scales of accelerometers in g and of gyroscopes in deg/s, as data sheets of MEMS sensors give them; the factory's
 # scale factors differ by some percent.
 _FULL_SCALES_M_S2 = STANDARD_GRAVITY_M_S2 * np.array([2.0, 4.0, 8.0, 16.0])
