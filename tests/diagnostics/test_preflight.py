@@ -24,6 +24,7 @@ from rangesfm.diagnostics.preflight import (
     notes_on_times,
 )
 from rangesfm.errors import InputError
+from rangesfm.measurements.kind_as_read import TimedLog
 from rangesfm.measurements.lengths.tape import Tape, TapedDistance
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
@@ -146,18 +147,25 @@ def test_positions_that_are_not_used_are_not_looked_at(complete: Survey) -> None
 WALK_S = np.linspace(0.0, 120.0, 400)
 
 
+def of_log(times_s: Array, words: str = "ranges", offset_s: float | None = None) -> TimedLog:
+    return TimedLog(words, None, times_s, offset_s)
+
+
 @pytest.mark.parametrize("offset_s", [0.0, -50.0, 1.7e9])
 def test_clocks_that_differ_are_no_matter(offset_s: float) -> None:
-    assert not list(notes_on_times(WALK_S + offset_s, WALK_S + 3.0))
+    assert not list(notes_on_times(of_log(WALK_S + offset_s), WALK_S + 3.0))
 
 
-def test_times_an_hour_apart_by_clocks_that_know_the_date_are_told() -> None:
-    (note,) = notes_on_times(WALK_S + 1.7e9, WALK_S + 1.7e9 + 3600)
+@pytest.mark.parametrize("words", ["ranges", "known positions"])
+def test_times_an_hour_apart_by_clocks_that_know_the_date_are_told(words: str) -> None:
+    (note,) = notes_on_times(of_log(WALK_S + 1.7e9, words), WALK_S + 1.7e9 + 3600)
+    assert note.startswith(f"by their clocks, {words} (2023-11-14 22:13:20.000 to 22:15:20.000 UTC) and photos (2023-")
     assert "0.97 h apart: another time zone, or another walk" in note
+    assert not list(notes_on_times(of_log(WALK_S + 1.7e9, words, offset_s=3600.0), WALK_S + 1.7e9 + 3600))
 
 
 def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
-    (note,) = notes_on_times(1e-3 * WALK_S, WALK_S)
+    (note,) = notes_on_times(of_log(1e-3 * WALK_S), WALK_S)
     assert note.startswith("the ranges last 0.12 s, the photos 120 s")
 
 
@@ -183,7 +191,7 @@ def test_time_without_ranges_is_told(is_one_clock: bool) -> None:
 
 @pytest.mark.parametrize(("num_ranges", "num_photos"), [(1, 400), (400, 1), (0, 400)])
 def test_one_range_or_one_photo_lasts_for_no_time_and_is_not_compared(num_ranges: int, num_photos: int) -> None:
-    assert not list(notes_on_times(WALK_S[:num_ranges], WALK_S[:num_photos]))
+    assert not list(notes_on_times(of_log(WALK_S[:num_ranges]), WALK_S[:num_photos]))
 
 
 def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pause_is_not() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.util.geometry.trajectory import Trajectory
 
 PHONE_START_S = 1777888800.0  # 2026-05-04 10:00:00 UTC
+AXES_OF_SENSORS = {"gyro": ("x_rad_s", "y_rad_s", "z_rad_s"), "accel": ("x_m_s2", "y_m_s2", "z_m_s2")}
 
 
 @pytest.fixture
@@ -26,6 +28,16 @@ def folder(tmp_path: Path) -> Path:
     write_log(tmp_path / "uwb.csv", PHONE_START_S + 5)
     write_anchors(tmp_path / "anchors.csv")
     return tmp_path
+
+
+def write_model(folder: Path, names: Sequence[str]) -> None:
+    """Write a model of poses of 20 photos."""
+    at = np.arange(20.0)
+    centers_m = np.column_stack([at, np.sin(at), np.zeros(20)])
+    folder.mkdir()
+    model_of_poses(Trajectory(np.arange(1, 21), tuple(names), at, centers_m, np.tile(np.eye(3), (20, 1, 1)))).write(
+        folder
+    )
 
 
 def survey_of(folder: Path, **keys: object) -> Survey:
@@ -89,6 +101,34 @@ def test_clocks_that_share_no_time_photos_without_times_and_missing_parts_are_fa
     assert [str(fault)[:9] for fault in faults] == ["no photos", "no ranges"]
 
 
+@pytest.mark.parametrize("with_model", [False, True])
+@pytest.mark.parametrize("kind", ["ranges", "positions", "imu"])
+def test_a_log_of_any_kind_that_shares_no_time_with_the_photos_is_a_fault(
+    kind: str, folder: Path, with_model: bool
+) -> None:
+    times_s = np.round(PHONE_START_S + np.arange(0.0, 20.0, 0.01), 2)
+    turns = [(time_s, 0.1, 0, 0, 0, 0, 9.8) for time_s in times_s.tolist()]
+    header = ",".join(
+        ["timestamp_s", *(f"gyro_{axis}_rad_s" for axis in "xyz"), *(f"accel_{axis}_m_s2" for axis in "xyz")]
+    )
+    write_rows(folder / "imu.csv", header, turns)
+    write_rows(
+        folder / "gps.csv", "timestamp_s,x_m,y_m,z_m", [(PHONE_START_S + k, 2.0 * k, 0.1 * k, 0) for k in range(20)]
+    )
+    path = {"ranges": folder / "uwb.csv", "positions": folder / "gps.csv", "imu": folder / "imu.csv"}[kind]
+    given = {"images__path": folder / "images", "ranges__path": None, f"{kind}__path": path}
+    if with_model:
+        write_model(folder / "sparse", [f"IMG_{k}.jpg" for k in range(20)])
+        given |= {"images__model": folder / "sparse"}
+    assert check_survey(survey_of(folder, **given, **{f"{kind}__time_offset": 0.0})).faults == []
+    (apart,) = check_survey(survey_of(folder, **given, **{f"{kind}__time_offset": -3600.0})).faults
+    assert apart.exit_status == 2
+    assert str(apart).startswith(f"{path}: the log's times (2026-05-04 10:00:0")
+    assert "plus an offset of -3600 s) do not overlap the photos' (2026-05-04 10:00:00.000 to 10:00:19.000 UTC)" in str(
+        apart
+    )
+
+
 def test_what_alone_determines_the_scale_is_told(folder: Path) -> None:
     rows = [(PHONE_START_S + k, 2.0 * k, np.sin(k), 0.1 * k) for k in range(20)]
     write_rows(folder / "gps.csv", "timestamp_s,x_m,y_m,z_m", rows)
@@ -101,10 +141,7 @@ def test_what_alone_determines_the_scale_is_told(folder: Path) -> None:
 def test_the_times_of_a_model_are_those_of_its_photos(folder: Path) -> None:
     at = np.arange(20.0)
     names = tuple(f"{k}.jpg" for k in range(20))
-    centers_m = np.column_stack([at, np.sin(at), np.zeros(20)])
-    path = Trajectory(np.arange(1, 21), names, at, centers_m, np.tile(np.eye(3), (20, 1, 1)))
-    (folder / "sparse").mkdir()
-    model_of_poses(path).write(folder / "sparse")
+    write_model(folder / "sparse", names)
     timed = [*zip(names[:15], at + PHONE_START_S), ("of another walk.jpg", PHONE_START_S + 1000)]
     write_rows(folder / "times.csv", "image_name,timestamp_s", timed)
     model = {"images.model": folder / "sparse", "images.times": folder / "times.csv", "ranges.path": folder / "uwb.csv"}

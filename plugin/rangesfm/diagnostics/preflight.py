@@ -14,6 +14,7 @@ from scipy import special
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.errors import InputError, number_text
+from rangesfm.measurements.kind_as_read import TimedLog
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.mistakes import FALSE_ALARM_RATE
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
@@ -26,7 +27,7 @@ from rangesfm.measurements.ranges.readers.table import MAPPED, TABLE
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.util.files.clock_times import are_seconds_since_1970
+from rangesfm.util.files.clock_times import are_seconds_since_1970, span_text
 from rangesfm.util.geometry.moments import ByPhoto
 
 SAME_PLACE_M = 0.01
@@ -161,26 +162,27 @@ def _share_of_one_value(ranges_m: Array) -> float:
     return float(np.unique(ranges_m, return_counts=True)[1].max() / len(ranges_m))
 
 
-def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
-    """Return notes on two clocks whose offset is to be searched for.
+def notes_on_times(timed: TimedLog, photos_s: Array) -> Iterator[str]:
+    """Return notes on a log whose time offset is to be searched for.
 
     Args:
-        radio_s, photos_s: times of ranges and photos, each by its own clock, in any order.
+        photos_s: times of the photos by their clock, in any order.
     """
-    if len(radio_s) < 2 or len(photos_s) < 2:
+    log_s, words = timed.timestamp_s, timed.words
+    if timed.offset_s is not None or len(log_s) < 2 or len(photos_s) < 2:
         return
-    radio, photos = (radio_s.min(), radio_s.max()), (photos_s.min(), photos_s.max())
-    lasts_s, photos_last_s = radio[1] - radio[0], photos[1] - photos[0]
+    log, photos = (log_s.min(), log_s.max()), (photos_s.min(), photos_s.max())
+    lasts_s, photos_last_s = log[1] - log[0], photos[1] - photos[0]
     if lasts_s < _MIN_SHARE_OF_TIME * photos_last_s:
         yield (
-            f"the ranges last {lasts_s:.4g} s, the photos {photos_last_s:.4g} s: most photos have no ranges; check "
-            "that log and photos are of one walk, and the unit of the times ([ranges] timestamp_unit)"
+            f"the {words} last {lasts_s:.4g} s, the photos {photos_last_s:.4g} s: most photos have none; check that "
+            "log and photos are of one walk, and the unit of the times"
         )
-    gap_s = max(radio[0] - photos[1], photos[0] - radio[1])
-    if all(map(are_seconds_since_1970, (*radio, *photos))) and gap_s > _LONG_GAP_S:
+    gap_s = max(log[0] - photos[1], photos[0] - log[1])
+    if all(map(are_seconds_since_1970, (*log, *photos))) and gap_s > _LONG_GAP_S:
         yield (
-            f"by their clocks, ranges and photos are {gap_s / 3600:.2g} h apart: another time zone, or another walk; "
-            "the offset is searched for, check what is found"
+            f"by their clocks, {words} ({timed.span}) and photos ({span_text(*photos)}) are {gap_s / 3600:.2g} h "
+            "apart: another time zone, or another walk; the offset is searched for, check what is found"
         )
 
 

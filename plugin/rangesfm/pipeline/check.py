@@ -20,6 +20,7 @@ from rangesfm.pipeline.map_photos import (
     with_keyframes,
     with_times_of_model,
 )
+from rangesfm.pipeline.place_ranges import check_times, path_of_model
 from rangesfm.progress import SILENT, Journal
 from rangesfm.sfm.camera import cameras_of_photos, check_camera
 from rangesfm.sfm.features import feature_options
@@ -33,7 +34,6 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.sources.source import is_source, open_source
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.clock_times import span_text
-from rangesfm.util.geometry.moments import ByPhoto
 
 # Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4
@@ -99,6 +99,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             num_keyframes = sfm.num_reg_frames()
             run = with_times_of_model(run, sfm)
             check_taped_ends(run.with_photos(keyframes, "the map"), keyframes)
+            check_times(run, path_of_model(run, sfm))
         _tell_of_times(run, num_keyframes, checked)
         if photos is not None:
             _check_mapper(survey, photos.subset(keyframes), checked)
@@ -193,28 +194,23 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
 
 
 def _tell_of_times(run: SurveyRun, num_keyframes: int, checked: CheckedSurvey) -> None:
-    times, moments, num = run.times, run.inputs.log.moments, len(run.inputs.log)
-    timed = num_keyframes if times is None or len(times) == num_keyframes else f"{len(times)} of {num_keyframes}"
-    if times is not None and isinstance(moments, ByPhoto):
-        first_s, last_s = times.timestamps_s[[0, -1]]
-        checked.facts.append(f"times: {timed} keyframes from {span_text(first_s, last_s)} ({times.source})")
-        return
+    times, logs = run.times, run.timed_logs
     if times is None:
-        why = "the ranges name their photos" if num else "there are no ranges"
+        why = "the ranges name their photos" if len(run.inputs.log) else "there are no ranges"
         checked.facts.append(f"times: none are needed for {num_keyframes} keyframes, {why}")
         return
-    radio_s, photos_s, offset_s = moments.timestamp_s, times.timestamps_s, run.survey.ranges.time_offset_s
-    checked.facts.append(
-        f"times: {timed} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
-        f"ranges from {span_text(radio_s.min(), radio_s.max())}"
-    )
-    at_s = radio_s + (offset_s or 0.0)
-    shared_s = max(min(at_s.max(), photos_s[-1]) - max(at_s.min(), photos_s[0]), 0.0)
-    overlap = f"the ranges cover {shared_s:.1f} of the {photos_s[-1] - photos_s[0]:.1f} s of the photos"
-    if offset_s is not None:
-        checked.facts.append(f"clocks: with the time offset of {offset_s:g} s, {overlap}")
-    else:
-        checked.assumed.append(f"the clocks differ by a time offset, which is searched for; without any, {overlap}")
+    timed = num_keyframes if len(times) == num_keyframes else f"{len(times)} of {num_keyframes}"
+    first_s, last_s = times.timestamps_s[[0, -1]]
+    of_logs = "".join(f", {log.words} from {log.span}" for log in logs)
+    checked.facts.append(f"times: {timed} keyframes from {span_text(first_s, last_s)} ({times.source}){of_logs}")
+    for log in logs:
+        at_s = log.image_times_s
+        shared_s = max(min(at_s.max(), last_s) - max(at_s.min(), first_s), 0.0)
+        overlap = f"the {log.words} cover {shared_s:.1f} of the {last_s - first_s:.1f} s of the photos"
+        if log.offset_s is not None:
+            checked.facts.append(f"clocks: with the time offset of {log.offset_s:g} s, {overlap}")
+        else:
+            checked.assumed.append(f"the clocks differ by a time offset, which is searched for; without any, {overlap}")
 
 
 def _counted(ids: Sequence[str], what: str) -> str:

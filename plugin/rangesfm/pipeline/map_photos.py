@@ -126,17 +126,14 @@ def with_times_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction) -> SurveyR
 
 
 def with_times(run: SurveyRun, times: ImageTimes) -> SurveyRun:
-    """Return the survey with the times of its photos, after warnings of their oddities.
-
-    The warnings are of both clocks if no time offset is given.
-    """
+    """Return the survey with the times of its photos, after warnings of their oddities and of other clocks."""
     log, options = run.inputs.log, run.survey.ranges
     if isinstance(log.moments, ByTime):
         run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
         at_s, is_given = log.timestamp_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
         run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
-        if not is_given:
-            run.journal.warn(*notes_on_times(log.timestamp_s, times.timestamps_s))
+    for timed in run.timed_logs:
+        run.journal.warn(*notes_on_times(timed, times.timestamps_s))
     return replace(run, times=times)
 
 

@@ -28,7 +28,7 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
         InputError: reference or ranges do not fit the first model.
         GeometryError: the ranges do not determine the time offset.
     """
-    trajectory = _path_of_model(run, models[0])
+    trajectory = path_of_model(run, models[0])
     num = models[0].num_reg_frames()
     if num_without_time := num - len(trajectory):
         run.journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
@@ -39,7 +39,7 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
     names = set(trajectory.image_names)
     for k, model in enumerate(models[1:], start=1):
         rest = without_photos(model, names)
-        path = _path_of_model(run, rest)
+        path = path_of_model(run, rest)
         if not len(path):
             run.journal.warn(f"sparse/{k} is left out: its photos have no times, or are also in other models")
             continue
@@ -50,20 +50,26 @@ def place_ranges(run: SurveyRun, models: Sequence[pycolmap.Reconstruction]) -> l
 
 
 def check_times(run: SurveyRun, path: Trajectory) -> None:
-    """Check that reference and ranges belong to the photos of a path, by names or times. Its positions do not matter.
+    """Check that all that was measured belongs to the photos of a path, by names or times. Its places do not matter.
 
     Raises:
-        InputError: the reference has none of the photos, or no range has a place on the path.
+        InputError: the reference has none of the photos, a log shares no time with them, or no range has a place on the
+            path.
     """
     reference, offset_s = run.inputs.reference, run.survey.ranges.time_offset_s
     if len(reference) and not np.isfinite(reference.positions_at(path)[0]).any():
         why = reference.why_nothing_is_known("keyframes", reference.moments_of(path))
         raise InputError(why, run.survey.report.reference)
+    photos_s, max_difference_s = path.timestamps_s, run.survey.ranges.max_time_difference_s
+    for timed in run.timed_logs:
+        if photos_s is not None and (apart := timed.why_apart(photos_s, max_difference_s)) is not None:
+            raise InputError(apart, timed.path)
     if isinstance(run.inputs.log.moments, ByPhoto) or offset_s is not None:
         run.ranges_on(path, offset_s or 0.0)
 
 
-def _path_of_model(run: SurveyRun, model: pycolmap.Reconstruction) -> Trajectory:
+def path_of_model(run: SurveyRun, model: pycolmap.Reconstruction) -> Trajectory:
+    """Return the path of a model; of the photos that have a time, if times are needed."""
     if run.times is None:
         return trajectory_from_reconstruction(model)
     return trajectory_from_reconstruction(model, run.times.by_name(), time_resolution_s=run.times.resolution_s)

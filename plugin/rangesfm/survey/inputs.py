@@ -82,7 +82,7 @@ class RangingInputs:
     @property
     def needs_times(self) -> bool:
         """True if the photos' times are needed, for ranges by time or for another kind."""
-        return isinstance(self.log.moments, ByTime) or any(each.needs_times for each in self.beside_ranges)
+        return isinstance(self.log.moments, ByTime) or any(each.timed is not None for each in self.beside_ranges)
 
     @property
     def beside_ranges(self) -> tuple[KindAsRead, ...]:

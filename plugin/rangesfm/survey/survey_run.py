@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
@@ -15,9 +14,10 @@ from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.clock.offset import NO_OFFSET, TimeOffset
 from rangesfm.measurements.kind import Doubt
+from rangesfm.measurements.kind_as_read import TimedLog
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeKind
-from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.measurements.ranges.range_observations import RangeObservations, hold_out
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.time_offset import estimate_time_offset
 from rangesfm.progress import Journal
@@ -26,9 +26,8 @@ from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
 from rangesfm.survey.settings import Survey
-from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.files.photo_names import told_none, told_unknown
-from rangesfm.util.geometry.moments import ByPhoto
+from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.trajectory import Trajectory
 
 
@@ -76,6 +75,17 @@ class SurveyRun:
     journal: Journal
     times: ImageTimes | None = None
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def timed_logs(self) -> tuple[TimedLog, ...]:
+        """All logs with clocks of their own, that of the radio first."""
+        log, inputs = self.inputs.log, self.inputs
+        others = filter(None, (each.timed for each in inputs.beside_ranges))
+        if not isinstance(log.moments, ByTime):
+            return tuple(others)
+        radio_s = log.timestamp_s[log.kind == RangeKind.TAG_ANCHOR]
+        options = self.survey.ranges
+        return (TimedLog("ranges", options.path, radio_s, options.time_offset_s), *others)
 
     def changed(self, values: Mapping[str, Any]) -> SurveyRun:
         """Return the same with other options by dotted key, as ``Survey.changed``."""
@@ -131,7 +141,7 @@ class SurveyRun:
         log, options = self.inputs.log, self.survey.ranges
         placed = associate(log, trajectory, self.inputs.tag_in_cam_m, time_offset_s=offset_s, options=options)
         if len(log) and not may_be_none and not placed.has_place.any():
-            why = _why_no_range_has_a_place(placed, trajectory, float(np.mean(offset_s)))
+            why = _why_no_range_has_a_place(placed, trajectory)
             raise InputError(why, options.path)
         return hold_out(placed, options, self.survey.output.seed)
 
@@ -153,14 +163,7 @@ class SurveyRun:
         return estimate_scale(located, bending, self.survey.scale, begun).remarked(remarks)
 
 
-def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
-    moments, photo_times = placed.log.moments, trajectory.timestamps_s
-    if isinstance(moments, ByPhoto) or photo_times is None:
-        return told_none("the log", moments.image_name, trajectory.image_names)
-    times = moments.timestamp_s
-    if np.all(placed.status[placed.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
-        return (
-            f"the log's times ({span_text(times.min(), times.max())}, plus an offset of {offset_s:g} s) do not "
-            f"overlap the photos' ({span_text(photo_times[0], photo_times[-1])}): give another time offset, or auto"
-        )
+def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory) -> str:
+    if isinstance(placed.log.moments, ByPhoto) or trajectory.timestamps_s is None:
+        return told_none("the log", placed.log.moments.image_name, trajectory.image_names)
     return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"

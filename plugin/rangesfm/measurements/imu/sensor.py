@@ -13,7 +13,7 @@ from rangesfm.measurements.imu.alignment import ImuAlignment, align_imu
 from rangesfm.measurements.imu.calibration import read_imu_noise
 from rangesfm.measurements.imu.formats import read_imu
 from rangesfm.measurements.imu.log import ImuLog
-from rangesfm.measurements.kind_as_read import KindAsRead
+from rangesfm.measurements.kind_as_read import KindAsRead, TimedLog
 from rangesfm.options import ImuOptions
 from rangesfm.util.files.clock_times import span_text
 from rangesfm.util.geometry.numerics import NORMAL_95
@@ -53,8 +53,9 @@ class InertialSensor(KindAsRead):
         return self.log.doubts
 
     @property
-    def needs_times(self) -> bool:
-        return True
+    def timed(self) -> TimedLog:
+        log = self.log
+        return TimedLog("samples of the inertial sensor", log.path or None, log.timestamp_s, self.time_offset_s)
 
     @property
     def notes_on_path(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.kind import Doubt
-from rangesfm.measurements.kind_as_read import KindAsRead
+from rangesfm.measurements.kind_as_read import KindAsRead, TimedLog
 from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions.antenna_track import AntennaTrack, locate_antenna
@@ -60,9 +60,14 @@ class SurveyedPositions(KindAsRead):
         return bool(self.points.points) or self.antenna is not None
 
     @property
-    def needs_times(self) -> bool:
-        """True if the photos' times are needed."""
-        return self.antenna is not None and isinstance(self.antenna.log.moments, ByTime)
+    def timed(self) -> TimedLog | None:
+        """Those of the antenna, if they are by time."""
+        if self.antenna is None or not isinstance(self.antenna.log.moments, ByTime):
+            return None
+        log, offset = self.antenna.log, self.antenna.offset
+        return TimedLog(
+            "known positions", log.path, log.moments.timestamp_s, None if offset is None else offset.value_s
+        )
 
     @property
     def clock_stddev_s(self) -> float:
