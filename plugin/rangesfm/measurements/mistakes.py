@@ -9,7 +9,6 @@ with as many degrees of freedom as H has columns (Baarda).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -309,20 +308,21 @@ def estimated(
     if not np.array_equal(rows, problem.is_used):
         problem = replace(problem, is_used=rows)
     kept = np.append(rows, np.ones(len(problem.prior_residual), dtype=bool))
-    solution = problem.solution
     if beside:
         linear, noise = problem.among(rows)
         solution = linear.with_more([each.columns[kept[: len(each.columns)]] for each in beside]).solved(
             noise.covariance_m2
         )
+    else:
+        solution = problem.solution
     whitened = solution.whitened(*(each.columns[kept[: len(each.columns)]] for each in mistakes))
-    left, by_unknowns = solution.left(whitened), solution.by_unknowns(whitened)
-    known = solution.whitened(*((each.columns[:num] if each.seen is None else each.seen)[rows] for each in mistakes))
-    parts = itertools.pairwise(np.cumsum([0, *(each.num for each in mistakes)]).tolist())
-    return [
-        _estimated(mistake, solution.residual, *(of[:, first:end] for of in (whitened, left, by_unknowns, known)))
-        for mistake, (first, end) in zip(mistakes, parts, strict=True)
-    ]
+    effects = whitened, solution.left(whitened), solution.by_unknowns(whitened)
+    ends, found = np.cumsum([each.num for each in mistakes]).tolist(), list[EstimatedMistake]()
+    for mistake, end in zip(mistakes, ends, strict=True):
+        own, left, by_unknowns = (of[:, end - mistake.num : end] for of in effects)
+        known = own[: len(solution.lower)] if mistake.seen is None else solution.whitened(mistake.seen[rows])
+        found.append(_estimated(mistake, solution.residual, own, left, by_unknowns, known))
+    return found
 
 
 def _estimated(
@@ -332,7 +332,8 @@ def _estimated(
 
     Args:
         residual: (c + r,) that the unknowns leave. whitened: (c + r, k) effect of the mistake. left: what they leave of
-            that. by_unknowns: (p, k) change of the estimate by it. known: (c + r, k) effect if the map was known.
+            that. by_unknowns: (p, k) change of the estimate by it. known: effect on the observations, whitened, if the
+            map was known; (c, k), or with zeros for the priors below them.
     """
     lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
     basis, values, turns = np.linalg.svd(left / lengths, full_matrices=False)
