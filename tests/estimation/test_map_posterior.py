@@ -11,7 +11,7 @@ from tests.estimation.test_photo_bending import NUM, NUM_OF_FIRST, bending_of, o
 from tests.simulated.model import random_similarity
 
 from rangesfm.colmap.transform import rescale
-from rangesfm.estimation.map_posterior import _turns_bounded, errors_at_estimate, firm_poses, sizes_of_parts
+from rangesfm.estimation.map_posterior import _turns_bounded, bending_of_firm_parts, errors_at_estimate, sizes_of_parts
 from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.solver.linear_map import Columns
@@ -115,9 +115,9 @@ def test_measurements_tell_the_size_of_a_part_that_no_point_ties_to_the_rest() -
     assert 0.0005 < size.stddev < 0.02
     # That the photos leave it open says nothing of how a map bends.
     assert 0.3 < on_map.problem.bending_factor < 5
-    poses = firm_poses(on_map)
-    assert poses is not None
-    assert poses.all()
+    bending = bending_of_firm_parts(on_map)
+    assert bending is not None
+    assert bending.is_firm.all()
 
 
 def test_a_part_that_neither_photos_nor_measurements_tie_to_the_rest_is_no_part_of_the_maps_size() -> None:
@@ -125,7 +125,7 @@ def test_a_part_that_neither_photos_nor_measurements_tie_to_the_rest_is_no_part_
     (size,) = sizes_of_parts(on_map)
     assert not size.is_determined
     assert size.stddev == pytest.approx(1.0, rel=0.1)
-    poses = firm_poses(on_map)
-    assert poses is not None
-    assert np.flatnonzero(poses).tolist() == list(range(NUM_OF_FIRST))
+    assert isinstance(on_map.bending, PhotoBending)
+    assert np.flatnonzero(on_map.bending.is_firm).tolist() == list(range(NUM_OF_FIRST))
+    assert bending_of_firm_parts(on_map) is None
     assert on_map.posterior.uncertainty.empirical < 0.02

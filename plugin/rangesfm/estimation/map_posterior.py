@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -94,15 +94,17 @@ def sizes_of_parts(on_map: JointMap) -> tuple[SizeOfPart, ...]:
     return tuple(map(SizeOfPart, parts, off.tolist(), stddevs.tolist()))
 
 
-def firm_poses(on_map: JointMap) -> Mask | None:
-    """Return a (k,) mask of the poses of all parts whose sizes photos and measurements tell; None if photos tell none.
+def bending_of_firm_parts(on_map: JointMap) -> PhotoBending | None:
+    """Return the bending of a map whose size and place are those of all parts whose sizes photos and measurements tell.
 
-    They are the map: its size and its place are theirs.
+    None if the map was measured with it already, or if photos do not say how it is bent.
     """
-    if not isinstance(on_map.bending, PhotoBending):
+    bending = on_map.bending
+    if not isinstance(bending, PhotoBending):
         return None
     told = (each.part for each in sizes_of_parts(on_map) if each.is_determined)
-    return np.asarray(np.any([on_map.bending.parts[0], *told], axis=0))
+    is_firm = np.any([bending.parts[0], *told], axis=0)
+    return None if np.array_equal(is_firm, bending.is_firm) else replace(bending, is_firm=is_firm)
 
 
 def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[str]) -> MapErrors:

@@ -11,8 +11,8 @@ from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import doubts_of_pieces
 from rangesfm.errors import GeometryError, number_text
-from rangesfm.estimation.map_posterior import firm_poses
-from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
+from rangesfm.estimation.map_posterior import bending_of_firm_parts
+from rangesfm.estimation.photo_bending import bending_of_model
 from rangesfm.measurements.kind import Doubt
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.pipeline.clock_rivals import by_rivals
@@ -41,9 +41,8 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         depends = loose_pieces(path.sfm) or run.inputs.may_be_left_out or not refine
         bending = bending_by_survey(run.survey, path) if depends else path.as_walk
         metric = scale_by_survey(run, path, bending, is_a_start=refine)
-        is_firm = firm_poses(metric.estimate.on_map)
-        if isinstance(bending, PhotoBending) and is_firm is not None and not np.array_equal(is_firm, bending.is_firm):
-            metric = scale_by_survey(run, path, replace(bending, is_firm=is_firm), is_a_start=refine)
+        if (of_firm := bending_of_firm_parts(metric.estimate.on_map)) is not None:
+            metric = scale_by_survey(run, path, of_firm, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
             metric = with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))

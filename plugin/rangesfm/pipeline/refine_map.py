@@ -15,7 +15,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.finished_map import why_broken
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.drift import bend
-from rangesfm.estimation.map_posterior import errors_at_estimate, firm_poses, likely_bend
+from rangesfm.estimation.map_posterior import bending_of_firm_parts, errors_at_estimate, likely_bend
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import PhotoBending, parts_of_path
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
@@ -176,18 +176,17 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, is_firm: Mask) -> MapBen
 def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap:
     """Return a map at rest with all that is measured in it."""
     of_largest = np.isin(metric.trajectory.frame_ids, rest.parts[0])
-    found = _measured_in(run, metric, rest, of_largest)
-    is_firm = firm_poses(found)
-    return found if is_firm is None or np.array_equal(is_firm, of_largest) else _measured_in(run, metric, rest, is_firm)
+    bending = _bending_at_rest(rest, metric.trajectory.as_in(rest.problem.metric), of_largest)
+    found = _measured_in(run, metric, rest, bending, of_largest)
+    of_firm = bending_of_firm_parts(found)
+    return found if of_firm is None else _measured_in(run, metric, rest, of_firm, of_firm.is_firm)
 
 
-def _measured_in(run: SurveyRun, metric: MetricResult, rest: MapAtRest, is_firm: Mask) -> JointMap:
+def _measured_in(run: SurveyRun, metric: MetricResult, rest: MapAtRest, bending: MapBending, is_firm: Mask) -> JointMap:
     """Return a map at rest with all that is measured in it; ``is_firm``: (k,) poses of the path that are its size."""
-    model, before = rest.problem.metric, metric.estimate.on_map.kinds
-    path = metric.trajectory.as_in(model)
-    scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
-    bending = _bending_at_rest(rest, path, is_firm)
-    of_model = MapOfPhotos(model, bending, run.survey, metric.observations, scale, before, rest)
+    before = metric.estimate.on_map.kinds
+    scale = align_points(metric.trajectory.centers[is_firm], bending.path.centers[is_firm]).scale
+    of_model = MapOfPhotos(rest.problem.metric, bending, run.survey, metric.observations, scale, before, rest)
     located, _ = kinds_in_map(metric.inputs, of_model)
     others = tested_kinds(
         [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
