@@ -19,8 +19,8 @@ from rangesfm.util.files.atomic import write_text
 from rangesfm.util.files.output_folder import sole_writer
 from rangesfm.util.files.records import write_json
 from rangesfm.util.files.text_tables import write_table
+from rangesfm.util.processes.supervision import POLL_INTERVAL_S
 
-_POLL_INTERVAL_S = 0.2
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 
 
@@ -94,7 +94,7 @@ def _take_in(batch_state: BatchState, inbox: queue.SimpleQueue[Any], index_of: d
     Returns:
         Whether any survey has ended.
     """
-    any_ended, wait_s = False, _POLL_INTERVAL_S
+    any_ended, wait_s = False, POLL_INTERVAL_S
     while True:
         try:
             item = inbox.get(timeout=wait_s)

@@ -23,7 +23,7 @@ from rangesfm.util.files.atomic import is_plain_name
 from rangesfm.util.files.contents import open_regular
 from rangesfm.util.files.text_tables import read_text
 from rangesfm.util.geometry.moments import ByPhoto
-from rangesfm.util.geometry.reference import read_reference
+from rangesfm.util.geometry.reference import QUATERNION_TOLERANCE, read_reference
 
 MAX_COORDINATE = 1e12
 """Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""
@@ -39,10 +39,7 @@ _NUM_BEFORE_NAME = 9
 _PHOTO_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _BLANK = "\u2423"  # in the place of a blank in a photo's name
 _EXPECTED = "expected cameras, images and points3D files that COLMAP wrote"
-# Largest difference of a quaternion's length from 1 that is corrected. Text files round quaternions, and some programs
-# write only a few digits.
-_MAX_QUATERNION_ERROR = 1e-2
-# Up to this difference a quaternion is left as it is.
+# Up to this difference of its length from 1 a quaternion is left as it is.
 _UNIT_LENGTH_ERROR = 1e-9
 _MAX_IMAGE_SIZE = 1_000_000
 
@@ -342,7 +339,7 @@ def _checked(pose: pycolmap.Rigid3d | None, what: str, path: Path) -> pycolmap.R
     if not np.all(np.abs(params) <= MAX_COORDINATE):
         raise InputError(f"{what} is not finite", path)
     length = float(np.linalg.norm(params[:4]))
-    if abs(length - 1) > _MAX_QUATERNION_ERROR:
+    if abs(length - 1) > QUATERNION_TOLERANCE:
         raise InputError(f"{what} has a quaternion of length {length:.4g}, expected 1", path)
     if abs(length - 1) <= _UNIT_LENGTH_ERROR:
         return pose

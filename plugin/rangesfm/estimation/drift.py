@@ -29,7 +29,7 @@ from rangesfm.estimation.vision_information import (
 from rangesfm.measurements.kind import Block, MapState, Measurements
 from rangesfm.solver.bending import FrameSteps
 from rangesfm.solver.bundle_adjustment import farthest
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.poses import Poses, model_poses
 from rangesfm.util.geometry.robust_statistics import wider
 from rangesfm.util.geometry.similarity import Similarity, align_points, are_apart, rmse
@@ -40,8 +40,6 @@ SAME_NOISE = 0.05
 # Movement of a keyframe, in standard deviations of a measurement, at which the solver stops. A turn of the whole world
 # by centimetres costs the full problem tens of iterations, since all points have to follow; here it costs one step.
 _TOLERANCE = 0.001
-# Movement of a keyframe, in standard deviations of a feature, above which photos show that loops were open.
-_NUM_VISIBLE_STDDEVS = 3.0
 
 
 def straighten(problem: MapProblem, rays: Rays) -> GraphSolution:
@@ -98,7 +96,7 @@ def close_in_graph(
     # A bundle adjustment follows in any case. More precisely, the graph takes tens of steps along weak modes.
     fit = solve_graph(graph, graph.start, tolerance_m=problem.visible_m)
     before, after = graph.vision.origin.centers, fit.state.poses.centers
-    if farthest(align_points(before, after).apply(before), after) <= _NUM_VISIBLE_STDDEVS * problem.visible_m:
+    if farthest(align_points(before, after).apply(before), after) <= SIGNIFICANT_STDDEVS * problem.visible_m:
         return None
     if problem.kinds:
         fit = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)

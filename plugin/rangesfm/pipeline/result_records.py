@@ -45,9 +45,6 @@ from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import Trajectory
 
-# A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
-_DISAGREES = 3.0
-
 
 def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
     """Return the content of ``result.json``.
@@ -261,11 +258,11 @@ def disagreements(rows: Iterable[entries.DistanceRow], relative_scale_stddev: fl
     """
     for row in rows:
         stddev_m = math.hypot(row.stddev_m, relative_scale_stddev * row.measured_m, BENDING * row.measured_m)
-        if row.kind == CHECK and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
+        if row.kind == CHECK and row.residual_m is not None and abs(row.residual_m) > SIGNIFICANT_STDDEVS * stddev_m:
             yield Doubt(
                 f"check distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
                 f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
-                f"{_DISAGREES * stddev_m:.3f} m)"
+                f"{SIGNIFICANT_STDDEVS * stddev_m:.3f} m)"
             )
 
 

@@ -19,11 +19,9 @@ import pycolmap
 from rangesfm.colmap.glog import logging_into
 from rangesfm.errors import ReconstructionError
 from rangesfm.progress import Progress
-from rangesfm.util.processes.supervision import end_group_with_parent
+from rangesfm.util.processes.supervision import POLL_INTERVAL_S, end_group_with_parent
 
 Result = TypeVar("Result")
-
-_POLL_INTERVAL_S = 0.2
 
 
 def run_in_background(
@@ -52,7 +50,7 @@ def run_in_background(
         executor.submit(int).result()
         try:
             future = executor.submit(work, token)
-            while not wait([future], timeout=_POLL_INTERVAL_S).done:
+            while not wait([future], timeout=POLL_INTERVAL_S).done:
                 progress.update(min(count(), num_total), num_total)
         except BaseException as error:
             token.cancel()

@@ -28,6 +28,7 @@ from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
 from rangesfm.measurements.ranges.readers.layout import MISSING
 from rangesfm.measurements.ranges.readers.lists import AXES, metres, times_by_row
+from rangesfm.measurements.ranges.readers.times import DAY_S
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, PositionOptions
 from rangesfm.util.files.text_tables import (
@@ -44,7 +45,6 @@ from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_
 
 DEGREES = Bounds(-360, 360, "degrees")
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
-_SECONDS_OF_DAY = 86400.0
 AUTONOMOUS_STDDEV_M = 3.0
 """Standard deviation of a coordinate by satellites without corrections, metres."""
 # Standard deviations of positions by the quality that NMEA's GGA reports, metres: autonomous, differential, fixed RTK,
@@ -255,7 +255,7 @@ def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
                 errors[_seconds_of_day(cells[0])] = np.array([float(cells[6]), float(cells[5]), float(cells[7])])
             elif int(cells[5]) > 0:
                 second = _seconds_of_day(cells[0])
-                day_s += _SECONDS_OF_DAY if second < last_s - _SECONDS_OF_DAY / 2 else 0.0
+                day_s += DAY_S if second < last_s - DAY_S / 2 else 0.0
                 last_s = second
                 height_m = float(cells[8]) + float(cells[10] or 0.0)
                 rows.append([day_s + second, _degrees(cells[3], cells[4]), _degrees(cells[1], cells[2]), height_m])

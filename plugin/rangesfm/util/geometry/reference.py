@@ -34,6 +34,7 @@ from rangesfm.util.geometry.trajectory import OnPath, Trajectory, places_in_time
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 QUATERNION_TOLERANCE = 1e-2
+"""Largest difference of the length of a quaternion in a file from 1; some programs write only a few digits."""
 _NANOSECONDS = re.compile(r"\d{19}(?:\.0*)?", re.ASCII)
 MAX_TIME_DIFFERENCE_S = 0.01
 """A sample this close in time is used without interpolation; at 1 m/s it is off by a centimetre at most."""

@@ -31,9 +31,10 @@ from typing import IO, Any, TextIO
 from rangesfm.errors import ReconstructionError, failure_of
 from rangesfm.progress import Progress
 
+POLL_INTERVAL_S = 0.2
+"""Time between two looks at work that is done elsewhere."""
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
-_POLL_INTERVAL_S = 0.2
 _MAX_STOP_S = 20.0  # an interrupted process that has not ended by then is killed
 _MAX_LINE = 200
 # Python puts the working folder first on the path, as "". A survey from somebody else may hold a numpy.py, which would
@@ -191,7 +192,7 @@ def supervise(
                 if time.monotonic() - stopped_at > _MAX_STOP_S:
                     process.kill()
                 with suppress(queue.Empty):
-                    if (line := lines.get(timeout=_POLL_INTERVAL_S)) is None:
+                    if (line := lines.get(timeout=POLL_INTERVAL_S)) is None:
                         break
                     last = json.loads(line)
                     listen(last)
@@ -273,7 +274,7 @@ def run_children(
             raise ReconstructionError(ended.how)
 
     def wait_for_first() -> None:
-        while not wait([pending[0]], timeout=_POLL_INTERVAL_S).done:
+        while not wait([pending[0]], timeout=POLL_INTERVAL_S).done:
             update(sum(num_done))
             for future in pending:
                 if future.done():

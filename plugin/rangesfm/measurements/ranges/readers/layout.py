@@ -37,6 +37,7 @@ from rangesfm.measurements.ranges.readers.vocabulary import (
 )
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS
 from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, num_cells, read_head, read_text
+from rangesfm.util.geometry.reference import QUATERNION_TOLERANCE
 
 _ANGLE = re.compile(
     r"([NSEW]?) ?(-?)(\d{1,3}(?:\.\d+)?) ?(?:°|º|deg) ?(?:(\d{1,2}(?:\.\d+)?) ?['’′])? ?"
@@ -65,7 +66,6 @@ MISSING = (
 _SEPARATORS = "\t;|, "  # the comma and the blank come last, because numbers may contain commas and times blanks
 _NUM_ROWS = 1000  # rows from which the layout is found
 _MOST_OF_LIST = 64  # lines of a list that somebody wrote
-_QUATERNION_TOLERANCE = 1e-2
 _MAX_NUM_WORDS = 20  # lines of text before the table
 _MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
@@ -320,7 +320,7 @@ def are_quaternions(columns: Sequence[ColumnSample]) -> bool:
     if len({len(column.numbers) for column in columns}) > 1 or not len(columns[0].numbers):
         return False
     lengths = np.linalg.norm([column.numbers for column in columns], axis=0)
-    return bool(np.all(np.abs(lengths - 1.0) < _QUATERNION_TOLERANCE))
+    return bool(np.all(np.abs(lengths - 1.0) < QUATERNION_TOLERANCE))
 
 
 def find_layout(path: Path, separator: str = "") -> Layout | None:

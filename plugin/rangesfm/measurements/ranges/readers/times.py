@@ -11,7 +11,8 @@ import numpy as np
 from rangesfm.measurements.ranges.twr import SECONDS_PER_STAMP
 from rangesfm.util.files.clock_times import are_seconds_since_1970
 
-SECONDS_PER_UNIT = {**SECONDS_PER_STAMP, "min": 60.0, "h": 3600.0, "d": 86400.0}
+DAY_S = 86400.0
+SECONDS_PER_UNIT = {**SECONDS_PER_STAMP, "min": 60.0, "h": 3600.0, "d": DAY_S}
 DATE_ORDERS = ("dmy", "mdy")
 CIVIL_UNITS = ("iso", *DATE_ORDERS)
 CIVIL_TIME = re.compile(
@@ -35,7 +36,6 @@ _WITH_MONTH = re.compile(
 _AS_EXIF = re.compile(r"(\d{4}):(\d\d):(\d\d)(?=[T ]\d\d?:)", re.ASCII)  # 2026:01:31 12:00:00
 _SHORT_YEAR = re.compile(r"(\d\d?)\.(\d\d?)\.(\d\d)(?=$|[T _]\d\d?:)", re.ASCII)  # 31.01.26 12:00:00
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
-_DAY_S = 86400.0
 # The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
 _UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
@@ -125,10 +125,10 @@ class Clock:
         if of_day is None:
             return _seconds_from_civil(text, self._unit if self._unit in DATE_ORDERS else "ymd")
         seconds = _hour(of_day[1], of_day[4]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
-        if seconds < self._last_of_day_s - _DAY_S / 2:
+        if seconds < self._last_of_day_s - DAY_S / 2:
             self._days += 1
         self._last_of_day_s = seconds
-        return self._days * _DAY_S + seconds
+        return self._days * DAY_S + seconds
 
     def find_seconds(self, prefix: str) -> float:
         """Return the time in a text in seconds, such as the host's time before a range; NaN without one.
