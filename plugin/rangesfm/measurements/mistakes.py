@@ -270,7 +270,7 @@ class EstimatedMistake:
         made, is_possible = self.mistake, self.is_possible
         length = float(self.sizes[0] if len(self.sizes) == 1 else np.linalg.norm(self.sizes))
         most = f"{made.most:.2g} {made.unit.replace('1', '')}".rstrip()
-        nothing = f"no {' '.join(made.key).strip()} that can happen ({most} at most) explains the ranges"
+        nothing = f"no {' '.join(made.key).strip()} that can happen ({most} at most) explains the measurements"
         return MistakeTest(
             *made.key,
             self.statistic if is_possible else 0.0,

@@ -224,7 +224,7 @@ def test_a_clock_that_runs_as_no_quartz_does_is_not_named_so() -> None:
     (row,) = [test for test in found.tests if test.name == "clock drift"]
     assert not row.rejected
     assert np.isnan(row.size)
-    assert row.words == "no clock drift that can happen (0.0002 s/s at most) explains the ranges"
+    assert row.words == "no clock drift that can happen (0.0002 s/s at most) explains the measurements"
 
 
 def test_a_tag_that_is_found_farther_than_its_camera_is_large_did_not_slip() -> None:
