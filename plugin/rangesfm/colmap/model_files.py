@@ -20,7 +20,7 @@ import pycolmap
 from rangesfm.colmap.model_faults import NUM_CAMERA_PARAMS, refuse_fault
 from rangesfm.errors import InputError
 from rangesfm.util.files.atomic import is_plain_name
-from rangesfm.util.files.contents import open_regular
+from rangesfm.util.files.contents import open_regular, stand_in
 from rangesfm.util.files.text_tables import read_text
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import QUATERNION_TOLERANCE, read_reference
@@ -88,6 +88,8 @@ def read_records(path: Path) -> Records:
     try:
         with open_regular(path) as file:
             data = file.read()
+        if what := stand_in(path, data):
+            raise InputError(what, path)
         for _ in range(_number(data, 0, "Q")):
             start.append(end[-1])
             groups, stop = _WALKS[path.name](data, start[-1])

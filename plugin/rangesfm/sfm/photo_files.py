@@ -13,7 +13,7 @@ from typing import Any
 from PIL import Image
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.util.files.contents import sha256_of, state_and_sha256
+from rangesfm.util.files.contents import open_regular, sha256_of, stand_in, state_and_sha256
 
 MIN_NUM_PHOTOS = 2
 MAX_PIXELS = 1_000_000_000
@@ -21,6 +21,7 @@ MAX_PIXELS = 1_000_000_000
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 """Errors that Pillow's readers raise."""
 _pillow_limit = threading.Lock()
+_HEAD_BYTES = 1 << 10
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE = 2, 4, 6
 _LATITUDE_REF, _LONGITUDE_REF, _ALTITUDE_REF = 1, 3, 5
@@ -95,7 +96,7 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
                 usable[name] = image.size
         except UNREADABLE as error:
             is_too_large = isinstance(error, Image.DecompressionBombError)
-            left_out[name] = str(error) if is_too_large else "cannot be read as an image"
+            left_out[name] = str(error) if is_too_large else _why_unreadable(folder / name)
     if len(usable) < MIN_NUM_PHOTOS:
         why = "".join(f"; {name} {reason}" for name, reason in list(left_out.items())[:1])
         raise ReconstructionError(
@@ -103,6 +104,15 @@ def usable_photos(folder: Path, names: Sequence[str]) -> Photos:
             f" readable ones{why}"
         )
     return Photos(folder, tuple(usable), tuple(usable.values()), left_out)
+
+
+def _why_unreadable(path: Path) -> str:
+    try:
+        with open_regular(path) as file:
+            what = stand_in(path, file.read(_HEAD_BYTES))
+    except OSError:
+        what = ""
+    return what or "cannot be read as an image"
 
 
 def image_size(path: Path) -> tuple[int, int] | None:

@@ -112,6 +112,81 @@ def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> N
         read(tmp_path, f"{names}\n2024/03/01 00:00:05.500 47.06 -1.35\n")
 
 
+def test_a_solution_of_rtklib_in_geocentric_coordinates_is_turned_to_east_north_up(tmp_path: Path) -> None:
+    names = "%  GPST x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s) ratio"
+    row = "2024/03/01 00:00:05.500 4345879.4430 705824.3170 4599894.7760 1 9 0.01 0.01 0.05 0.0 0.0 0.0 0.0 9.9"
+    found = read(tmp_path, f"{names}\n{row}\n")
+    lon_deg, lat_deg, height_m = found.position_m[0]
+    assert found.crs == GEOGRAPHIC
+    assert lon_deg == pytest.approx(np.rad2deg(np.arctan2(705824.3170, 4345879.4430)), abs=1e-9)
+    # Formulas of the ellipsoid WGS 84.
+    lat, square = np.deg2rad(lat_deg), 6.69437999014e-3
+    normal_m = 6378137.0 / np.sqrt(1 - square * np.sin(lat) ** 2)
+    assert (normal_m + height_m) * np.cos(lat) == pytest.approx(np.hypot(4345879.4430, 705824.3170), abs=1e-3)
+    assert (normal_m * (1 - square) + height_m) * np.sin(lat) == pytest.approx(4599894.7760, abs=1e-3)
+    # The axis of the Earth, of which little is known, points north and up.
+    axis = np.array([0.0, np.cos(lat), np.sin(lat)])
+    np.testing.assert_allclose(found.covariance_m2[0], 1e-4 * np.eye(3) + 24e-4 * np.outer(axis, axis), atol=1e-9)
+
+
+GPX = """<?xml version="1.0" encoding="UTF-8"?>
+<gpx version="1.1" creator="phone" xmlns="http://www.topografix.com/GPX/1/1">
+<metadata><time>2024-06-01T11:00:00Z</time></metadata>
+<wpt lat="1" lon="2"><ele>3</ele></wpt>
+<trk><trkseg>
+"""
+GPX_POINT = """<trkpt {}>
+  <ele>43{}.25</ele>
+  <time>2024-06-01T1{}Z</time>
+</trkpt>
+"""
+
+
+def test_points_of_tracks_in_gpx_are_positions(tmp_path: Path) -> None:
+    points = [
+        GPX_POINT.format('lat="47.5" lon="9.25"', 0, "1:06:40"),
+        GPX_POINT.format("lon='9.5' lat='47.75'", 1, "1:06:41.500"),
+        GPX_POINT.format("lon='9.5' lat='47.75'", 2, "1:06:42").replace("<ele>432.25</ele>", ""),
+    ]
+    whole = GPX + "".join(points) + "</trkseg></trk></gpx>\n"
+    for text in (whole, whole[: whole.rindex("</trkpt>")]):  # the phone's battery was empty
+        found = read(tmp_path, text)
+        assert (found.format, found.crs) == ("gpx", GEOGRAPHIC)
+        np.testing.assert_array_equal(found.position_m, [[9.25, 47.5, 430.25], [9.5, 47.75, 431.25]])
+        np.testing.assert_allclose(found.moments.timestamp_s, [1717240000.0, 1717240001.5])
+    with pytest.raises(InputError, match=r"positions\.txt:10: lat is 'here', expected"):
+        read(tmp_path, whole.replace("47.75", "here", 1))
+    with pytest.raises(InputError, match=r"no point of its tracks has a height"):
+        read(tmp_path, whole.replace("ele>", "altitude>"))
+    with pytest.raises(InputError, match=r"holds no point of a track"):
+        read(tmp_path, GPX + "</trkseg></trk></gpx>\n")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "Label,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_X/Y_(m),Accuracy_Z_(m)",
+        "imagename,longitude,latitude,altitude,accuracy horizontal,accuracy vertical",
+    ],
+)
+def test_a_standard_deviation_of_two_coordinates_is_that_of_each(names: str, tmp_path: Path) -> None:
+    found = read(tmp_path, f"{names}\nIMG_1,9.0,47.0,430.0,0.02,0.05\nIMG_2,9.00001,47.0,431.0,0.03,0.06\n")
+    np.testing.assert_allclose(np.sqrt(found.covariance_m2[0]), np.diag([0.02, 0.02, 0.05]))
+
+
+def test_the_principal_point_in_a_list_of_cameras_is_no_place(tmp_path: Path) -> None:
+    names = "#cameras 2\n#name,x,y,alt,yaw,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
+    rows = "".join(f"IMG_{k}.jpg,{k}.5,2.5,{3 + k}.5,12.1,80.2,0.5,28.1,0.01,0.02,0,0,0,0,0,0\n" for k in range(2))
+    found = read(tmp_path, f"{names}\n{rows}")
+    np.testing.assert_array_equal(found.position_m, [[0.5, 2.5, 3.5], [1.5, 2.5, 4.5]])
+
+
+def test_latitude_before_longitude_is_offered_in_a_list_without_names(tmp_path: Path) -> None:
+    with pytest.raises(UnclearFileError) as error:
+        read(tmp_path, by_photo("{photo},{y},{x},{z},0.02,0.05"))
+    assert "image_name=1,x=3,y=2,z=4" in [choice.flags["position_columns"] for choice in error.value.choices]
+
+
 def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{1700000000000 + 100 * k},100,{100 * k},5,1.0{k},2.0,0.5,1,3.2,2,4.1\n" for k in range(3))
     found = read(tmp_path, rows)

@@ -10,7 +10,10 @@ from tests.measurements.ranges.readers.test_readers_ros import message, write_ba
 from tests.simulated.phone_survey import write_photos
 from tests.survey.sources.recorded import raw, write_bag
 
-from rangesfm.errors import InputError
+from rangesfm.colmap.model_files import read_model
+from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.measurements.ranges.readers import read_ranges
+from rangesfm.sfm.photo_files import usable_photos
 from rangesfm.survey.discovery.found_files import Found, look_into
 
 CONTENTS = {
@@ -117,6 +120,31 @@ def test_a_bag_with_images_is_photos_and_what_a_run_took_out_of_it_is_not(tmp_pa
     write_photos(tmp_path / "out" / "photos", 3)
     (tmp_path / "out" / "photos" / "photos.json").touch()
     assert look_into([tmp_path]).paths == {"images.path": [tmp_path / "walk"], "ranges.path": [tmp_path / "walk"]}
+
+
+def test_a_track_of_a_phone_is_positions(tmp_path: Path) -> None:
+    (tmp_path / "walk.gpx").write_text('<gpx><trk><trkseg><trkpt lat="47" lon="9"><ele>4</ele></trkpt></trkseg></trk>')
+    assert paths(look_into([tmp_path])) == {"positions.path": ["walk.gpx"]}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n", "is a pointer of Git LFS"),
+        ("<!DOCTYPE html>\n<html><body>Sign in, 1, 2, 3</body></html>\n", "is an HTML page"),
+    ],
+)
+def test_what_stands_in_place_of_a_file_is_said(content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "uwb.csv").write_text(content)
+    assert [said in note for note in look_into([tmp_path]).notes] == [True]
+    with pytest.raises(InputError, match=f"uwb.csv: {said} in place of the file itself"):
+        read_ranges(tmp_path / "uwb.csv")
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "a.jpg", "b.jpg"):
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=f"cameras.bin: {said}"):
+        read_model(tmp_path)
+    with pytest.raises(ReconstructionError, match=f"; a.jpg {said}"):
+        usable_photos(tmp_path, ["a.jpg", "b.jpg"])
 
 
 def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -> None:

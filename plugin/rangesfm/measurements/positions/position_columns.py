@@ -95,6 +95,8 @@ def _labels(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
 def _axes_by_name(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
     """Find x, y, z by their names; else return the columns that they may be, by the case in which they are."""
     numbers = [column for column in free if column.kind == "numbers"]
+    if not any("pz" in column.words for column in numbers):  # the other two are a camera's principal point
+        numbers = [column for column in numbers if {"px", "py"}.isdisjoint(column.words)]
     may_be = columns_by_name(numbers, _AXES_BY_NAME)
     of_axis = {axis: [column.name for column in coordinates_of_point(may_be[axis])] for axis in AXES}
     groups = [*_triples(numbers)]
@@ -157,8 +159,9 @@ def _add_errors(free: Sequence[ColumnSample], columns: dict[str, str]) -> None:
         if column.name in columns.values():
             continue
         if words & terms.STDDEV:
-            of_axes = [f"stddev_{axis}" for axis in AXES if words & terms.COORDINATES[axis]]
-            columns.setdefault(of_axes[0] if of_axes else "stddev", column.name)
+            of_axes = [f"stddev_{axis}" for axis in AXES if words & (terms.COORDINATES[axis] | terms.IN_PLANE[axis])]
+            for quantity in of_axes or ["stddev"]:
+                columns.setdefault(quantity, column.name)
         elif words & terms.TAG and words <= terms.TAG | terms.ID:
             columns.setdefault("tag_id", column.name)
         elif words & terms.QUALITY and words <= terms.QUALITY | terms.BESIDE_QUALITY and column.is_whole:
@@ -193,6 +196,11 @@ def _possible_keys(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str
 
 def _possible_places(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the columns that may be x, y and z, after what they would be."""
-    numbers = [column.name for column in free if column.kind == "numbers"]
-    for names in zip(*(numbers[k:] for k in range(len(AXES)))):
-        yield f"{', '.join(names)} are x, y, z", dict(zip(AXES, names))
+    numbers = [column for column in free if column.kind == "numbers"]
+    for places in zip(*(numbers[k:] for k in range(len(AXES)))):
+        names = [column.name for column in places]
+        those = f"{', '.join(names)} are"
+        yield f"{those} x, y, z", dict(zip(AXES, names))
+        if _may_be_degrees(places):
+            order = ("y", "x", "z")
+            yield f"{those} latitude, longitude, height (--position_crs EPSG:4326)", dict(zip(order, names))

@@ -1,4 +1,4 @@
-"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, ODM, Marvelmind's dashboard, and COLMAP's databases.
+"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, GPX, ODM, Marvelmind's dashboard, COLMAP's databases.
 
 Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
 write tables with names of columns, which are recognised like those of range logs.
@@ -39,7 +39,7 @@ from rangesfm.util.files.text_tables import (
     read_text,
     read_without_header,
 )
-from rangesfm.util.geometry.georeference import GEOGRAPHIC
+from rangesfm.util.geometry.georeference import GEOCENTRIC, GEOGRAPHIC, geographic_of, rotation_to_enu
 from rangesfm.util.geometry.moments import ByPhoto, ByTime, Moments
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
 
@@ -51,6 +51,8 @@ AUTONOMOUS_STDDEV_M = 3.0
 # float RTK. Receivers that send GST sentences say it themselves.
 _NMEA_STDDEVS_M = {1: AUTONOMOUS_STDDEV_M, 2: 1.0, 4: 0.02, 5: 0.3}
 _NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?\s*")
+
+_GPX_POINT = "<trkpt"  # of a track
 
 Reader = Callable[[Path, PositionOptions], PositionLog]
 
@@ -76,7 +78,7 @@ def read_positions(path: Path, options: PositionOptions) -> PositionLog:
 
 def is_of_positions(head: str) -> bool:
     """Return whether a file with this beginning holds measured positions in a format that nothing else looks like."""
-    return _is_nmea(head) or _is_rtklib(head) or _is_odm(head)
+    return _is_nmea(head) or _is_rtklib(head) or _is_odm(head) or (_is_gpx(head) and _GPX_POINT in head)
 
 
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
@@ -313,18 +315,17 @@ def _rtklib_header(lines: Sequence[str]) -> list[str] | None:
 
 
 def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
-    """Read a solution (.pos) of RTKLIB: latitude and longitude, or east, north and up from a base, with covariances.
+    """Read a solution (.pos) of RTKLIB with its covariances.
 
-    Source: RTKLIB manual 2.4.2, appendix B.1. The off-diagonal columns are signed roots of covariances.
+    It has latitude and longitude, geocentric x, y, z (ECEF), or east, north and up from a base. Source: RTKLIB manual
+    2.4.2, appendix B.1. The off-diagonal columns are signed roots of covariances.
     """
     names = _rtklib_header(read_text(path).split("\n"))
     if names is None:
         raise InputError("has no header row of an RTKLIB solution (% GPST ...)", path)
-    is_geographic, is_enu = "latitude(deg)" in names, "e-baseline(m)" in names
-    if not (is_geographic or is_enu):
-        raise InputError(
-            "an RTKLIB solution with these columns is not read, expected latitude, longitude, height", path
-        )
+    is_geographic, is_ecef = "latitude(deg)" in names, "x-ecef(m)" in names
+    if not (is_geographic or is_ecef or "e-baseline(m)" in names):
+        raise InputError("an RTKLIB solution with these columns is not read, expected degrees and metres", path)
     columns = ("date", "time", *names[1:12])
     table = read_without_header(path, columns, has_more=True, is_no_row=lambda line: line.startswith("%"))
     values = np.column_stack([table.numbers(name) for name in columns[2:]])
@@ -337,10 +338,14 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
     east_first = values[:, [1, 0, 2]] if is_geographic else values[:, :3]
     notes = ["times are GPS time, which is ahead of UTC by leap seconds"] if names[0] == "GPST" else []
     covariance_m2 = _covariance_of_rtklib(values[:, 5:11], is_geographic)
+    if is_ecef:
+        east_first = geographic_of(east_first, GEOCENTRIC)
+        enu_from_ecef = rotation_to_enu(*east_first[:, :2].mean(axis=0).tolist())
+        covariance_m2 = enu_from_ecef @ covariance_m2 @ enu_from_ecef.T
     log = PositionLog.in_time_order(
         path, "rtklib", east_first, ByTime(times_s), table.line, covariance_m2=covariance_m2, notes=notes
     )
-    return replace(log, crs=GEOGRAPHIC if is_geographic else "")
+    return replace(log, crs=GEOGRAPHIC if is_geographic or is_ecef else "")
 
 
 def _time_of_rtklib(first: str, second: str) -> float:
@@ -353,7 +358,10 @@ def _time_of_rtklib(first: str, second: str) -> float:
 
 
 def _covariance_of_rtklib(roots: Array, is_geographic: bool) -> Array:
-    """Return (n, 3, 3) covariances east, north, up from sdn, sde, sdu, sdne, sdeu, sdun; sde, sdn, .. of baselines."""
+    """Return (n, 3, 3) covariances in the order of the axes from sdx, sdy, sdz, sdxy, sdyz, sdzx.
+
+    With latitude and longitude the columns are sdn, sde, sdu, sdne, sdeu, sdun, and east is first here.
+    """
     north, east, up = (0, 1, 2) if is_geographic else (1, 0, 2)
     squares = np.sign(roots) * roots**2
     covariances = np.zeros((len(roots), 3, 3))
@@ -372,10 +380,37 @@ def _covariance_of_rtklib(roots: Array, is_geographic: bool) -> Array:
     return covariances
 
 
+def _is_gpx(head: str) -> bool:
+    return "<gpx" in head
+
+
+def _read_gpx(path: Path, options: PositionOptions) -> PositionLog:
+    """Read the points of the tracks of a GPX file (topografix.com/gpx/1/1): latitude, longitude, elevation, time.
+
+    A file that was cut off is read as far as it goes.
+    """
+    before, *points = read_text(path).split(_GPX_POINT)
+    if not points:
+        raise InputError("holds no point of a track, expected <trkpt> with <ele> and <time>", path)
+    lines = 1 + np.cumsum([part.count("\n") for part in (before, *points[:-1])])
+    columns = {"timestamp": ("time", "<time>([^<]*)"), "x": ("lon", "lon *= *[\"']([^\"']*)")}
+    columns |= {"y": ("lat", "lat *= *[\"']([^\"']*)"), "z": ("ele", "<ele>([^<]*)")}
+    cells = {
+        quantity: [found[1].strip() if (found := re.search(pattern, point)) else "" for point in points]
+        for quantity, (_, pattern) in columns.items()
+    }
+    table = TextTable(path, lines, cells, {quantity: name for quantity, (name, _) in columns.items()})
+    if not any(cells["z"]):
+        raise InputError("no point of its tracks has a height, expected <ele>", path)
+    notes = ("heights of GPX are above the sea, or above the ellipsoid, which moves all of them alike",)
+    return _log_of_table(replace(table, notes=notes), options, "iso", "gpx")
+
+
 POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "colmap": (is_database, lambda path, _options: read_pose_priors(path)),
     "nmea": (_is_nmea, _read_nmea),
     "rtklib": (_is_rtklib, _read_rtklib),
+    "gpx": (_is_gpx, _read_gpx),
     "odm": (_is_odm, _read_odm),
     "tum": (_is_tum, _read_tum),
     "marvelmind": (_is_marvelmind, _read_marvelmind),

@@ -52,7 +52,7 @@ _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
     **dict.fromkeys((".xlsx", ".xls", ".ods", ".numbers"), "save the sheet as CSV"),
-    **dict.fromkeys((".xml", ".jxl", ".dxf", ".dwg", ".shp", ".kml", ".kmz", ".gpx", ".rw5"), "export points as CSV"),
+    **dict.fromkeys((".xml", ".jxl", ".dxf", ".dwg", ".shp", ".kml", ".kmz", ".rw5"), "export points as CSV"),
 }
 _UNKNOWN = "no input that is known"
 SURVEY_NAME = "survey.toml"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import stat
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +16,9 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 # Byte ranges of counters in SQLite's header. They change whenever the file is opened for writing, which COLMAP does
 # even to look at a database. Source: https://www.sqlite.org/fileformat2.html, sections 1.3.7 and 1.3.18.
 _SQLITE_COUNTERS = ((24, 28), (92, 96))
+
+_LFS_POINTER = b"version https://git-lfs.github.com/"
+_HTML = re.compile(rb"(?:\xef\xbb\xbf)?\s{0,99}<(?:!doctype html|html)\b", re.IGNORECASE)
 
 State = tuple[int, int, int]
 AnyPath = str | os.PathLike[str]
@@ -33,6 +37,15 @@ def open_regular(path: AnyPath) -> BinaryIO:
     if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
     return open(path, "rb")
+
+
+def stand_in(path: AnyPath, head: bytes) -> str:
+    """Return what a file with this beginning is, if it was stored in place of the wanted one; "" if it is none."""
+    if head.startswith(_LFS_POINTER):
+        return "is a pointer of Git LFS in place of the file itself: fetch that (git lfs pull)"
+    if _HTML.match(head) and not str(path).lower().endswith((".html", ".htm")):
+        return "is an HTML page in place of the file itself: download that again"
+    return ""
 
 
 def sha256_of(path: Path, *, but_counters: bool = False) -> str:

@@ -30,7 +30,7 @@ from rangesfm.arrays import Categories
 from rangesfm.errors import InputError, printable
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.atomic import new_file
-from rangesfm.util.files.contents import AnyPath, open_regular
+from rangesfm.util.files.contents import AnyPath, open_regular, stand_in
 
 MAX_NUMBER = 1e100
 """The largest number in any file; its squares are finite."""
@@ -359,6 +359,14 @@ def guess_separator(row: str) -> str:
 
 
 def _read_bytes(path: AnyPath, num: int = -1) -> bytes:
+    """Return the first bytes of a file, all by default, unpacked if it is packed; errors are InputErrors."""
+    data = _stored_bytes(path, num)
+    if what := stand_in(path, data):
+        raise InputError(what, path)
+    return data
+
+
+def _stored_bytes(path: AnyPath, num: int) -> bytes:
     try:
         with open_regular(path) as file:
             if os.fstat(file.fileno()).st_size == 0:  # like the kernel's own files, some of which never end

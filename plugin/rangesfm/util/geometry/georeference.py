@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres; always in this order here."""
+GEOCENTRIC = "EPSG:4978"
+"""WGS 84: x, y, z from the centre of the Earth in metres (ECEF)."""
 
 # Points may lie this far outside the area for which a coordinate system was made.
 _MARGIN_DEG = 1.0
@@ -65,7 +67,7 @@ class Georeference:
         Raises:
             InputError: the coordinate system is unknown, or is not valid at these points.
         """
-        geographic = _geographic_of(coordinates, crs)
+        geographic = geographic_of(coordinates, crs)
         return self.enu_from_world.inverse().apply(_apply(self._enu_from_geographic, geographic))
 
     @cached_property
@@ -84,13 +86,26 @@ def georeference_at(coordinates: Array, crs: str) -> tuple[Georeference, Array]:
     Raises:
         InputError: the coordinate system is unknown, or is not valid at these points.
     """
-    geographic = _geographic_of(coordinates, crs)
+    geographic = geographic_of(coordinates, crs)
     lon_deg, lat_deg, height_m = np.nanmean(geographic, axis=0).tolist()
     georeference = Georeference(lat_deg, lon_deg, height_m, crs)
     return georeference, _apply(georeference._enu_from_geographic, geographic)
 
 
-def _geographic_of(coordinates: Array, crs: str) -> Array:
+def rotation_to_enu(lon_deg: float, lat_deg: float) -> Array:
+    """Return the (3, 3) rotation from geocentric axes to east, north, up at a place."""
+    lon, lat = np.deg2rad((lon_deg, lat_deg))
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    return np.stack([east, np.cross(up, east), up])
+
+
+def geographic_of(coordinates: Array, crs: str) -> Array:
+    """Return longitude and latitude in degrees and height in metres, (n, 3), of points in a coordinate system.
+
+    Raises:
+        InputError: the coordinate system is unknown, or is not valid at these points.
+    """
     geographic = _apply(_geographic_from(crs), coordinates)
     if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
         raise InputError(f"coordinates lie outside the area in which {crs} is valid: are they east, north, height?")

@@ -267,6 +267,25 @@ def test_lists_in_messages_of_rostopic_are_a_row_each(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.range_m[:2], [9.5, 10.5])
 
 
+def test_items_of_lists_whose_dash_is_alone_in_its_line_are_a_row_each(tmp_path: Path) -> None:
+    content = "".join(
+        f"id: 0\nsystem_time: {1000 * k}\nnodes: \n"
+        + "".join(f"  - \n    role: 1\n    id: {anchor}\n    dis: {2.5 + anchor}\n" for anchor in (7, 8))
+        + "---\n"
+        for k in range(30)
+    )
+    log = read_ranges(write(tmp_path, content))
+    assert (len(log), log.anchor_ids, log.tag_ids) == (60, ("7", "8"), ("0",))
+    np.testing.assert_array_equal(log.range_m[:2], [9.5, 10.5])
+
+
+def test_an_id_behind_the_word_for_an_anchor_names_it(tmp_path: Path) -> None:
+    row = "{} -> Anchor 0x{} distance: {:.3f} m RSSI: -78.2 dBm"
+    log = read_ranges(write(tmp_path, lines(None, lambda t, a, r: row.format(clock(t), NUM[a], r))))
+    assert [log.anchor_ids[k] for k in log.anchor_index] == [f"0x{NUM[a]}" for _, a, _ in ROWS]
+    np.testing.assert_allclose(log.range_m, [r for *_, r in ROWS], atol=6e-4)
+
+
 @pytest.mark.parametrize("nothing", ["65535", "4294967.295", "9999"])
 def test_a_value_far_above_all_others_that_comes_again_is_no_measurement(tmp_path: Path, nothing: str) -> None:
     log = read_ranges(write(tmp_path, PLAIN + f"15,A0,{nothing}\n16,A0,{nothing}\n17,A0,{nothing}\n"))
@@ -335,7 +354,8 @@ def test_times_of_day_go_on_after_midnight(tmp_path: Path) -> None:
 
 
 def test_zone_of_civil_times_counts_and_its_lack_is_said(tmp_path: Path) -> None:
-    for zone, seconds, said in (("+02:00", 7200, False), ("Z", 0, False), ("", 0, True)):
+    named = ((" CEST", 7200, False), (" EST", -18000, False), (" GMT", 0, False), (" UTC+2", 7200, False))
+    for zone, seconds, said in (("+02:00", 7200, False), ("Z", 0, False), ("", 0, True), *named):
         row = "2026-01-31 {}" + zone + ",{},{:.3f}"
         content = lines("time,anchor,range", lambda t, a, r, row=row: row.format(clock(t + 36000), a, r))  # type: ignore[misc]
         log = read_ranges(write(tmp_path, content))

@@ -31,6 +31,7 @@ from rangesfm.measurements.ranges.readers.vocabulary import (
     LENGTHS,
     POINT,
     STDDEV,
+    TAG,
     TIMES,
     named_length_unit,
     words_of,
@@ -91,7 +92,11 @@ _UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
 NamedValues = dict[str, str]
 _BLOCK = "\n---\n"  # end of a message of rostopic echo
-_NAMED = re.compile(r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +)(\"[^\"]*\"|[^\s,;\[\]{}]+)", re.ASCII)
+_NAMED = re.compile(
+    r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +(?!\w+=))(\"[^\"]*\"|[^\s,;\[\]{}]+)"
+    rf"|\b({'|'.join(sorted(ANCHOR | TAG))}) #?(\w*\d\w*)\b(?! ?[=:])",  # Anchor 0x01 distance: 3.45 m
+    re.ASCII | re.IGNORECASE,
+)
 _KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
 # Smallest share of lines or blocks with named values, and of lines with JSON, in a file of records. Boards print other
 # lines beside JSON.
@@ -535,7 +540,8 @@ def _named_records(text: str) -> Iterator[tuple[int, NamedValues]]:
     for line, unit in _units(text):
         time = CIVIL_TIME.search(unit) or TIME_OF_DAY.search(unit)
         record, num = {"time": time[0]} if time else {}, Counter[str]()
-        for name, value in _NAMED.findall(unit):
+        for found in _NAMED.finditer(unit):
+            name, value = filter(None, found.groups())
             num[name] += 1
             record[name if num[name] == 1 else f"{name}.{num[name]}"] = value.strip('"')
         yield line, record
@@ -543,7 +549,8 @@ def _named_records(text: str) -> Iterator[tuple[int, NamedValues]]:
 
 def _blocks(text: str) -> Iterator[tuple[int, NamedValues]]:
     for line, unit in _units(text):
-        lines = [(len(row) - len(row.lstrip()), row.strip()) for row in unit.split("\n") if row.strip("- \t")]
+        rows = [row for row in unit.split("\n") if row.strip() not in ("", "---")]
+        lines = [(len(row) - len(row.lstrip()), row.strip()) for row in rows]
         yield from ((line, record) for record in _flat(_nested(lines)))
 
 

@@ -15,9 +15,18 @@ DAY_S = 86400.0
 SECONDS_PER_UNIT = {**SECONDS_PER_STAMP, "min": 60.0, "h": 3600.0, "d": DAY_S}
 DATE_ORDERS = ("dmy", "mdy")
 CIVIL_UNITS = ("iso", *DATE_ORDERS)
+# fmt: off
+# Hours by which zones are ahead of UTC, of names that mean only one; CST is China's and Chicago's.
+_ZONES = {
+    "Z": 0, "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2, "EET": 2,
+    "EEST": 3, "JST": 9, "KST": 9, "AEST": 10, "AEDT": 11, "NZST": 12, "NZDT": 13,
+    "EST": -5, "EDT": -4, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8, "PDT": -7,
+}
+# fmt: on
 CIVIL_TIME = re.compile(
     r"((?:\d{4}[-/.]\d\d?[-/.]\d\d?)|(?:\d\d?[-/.]\d\d?[-/.]\d{4}))[T _]"
-    r"(\d\d?):(\d\d(?::\d\d(?:[.,]\d{1,18})?)?)(?: ?([AP])M)? ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
+    r"(\d\d?):(\d\d(?::\d\d(?:[.,]\d{1,18})?)?)(?: ?([AP])M)? ?"
+    rf"((?:UTC|GMT)?[+-]\d\d?(?::?\d\d)?(?!\d)|(?:{'|'.join(_ZONES)})(?![A-Z]))?",
     re.ASCII | re.IGNORECASE,
 )
 TIME_OF_DAY = re.compile(
@@ -81,10 +90,11 @@ def _seconds_from_civil(text: str, order: str) -> float:
         np.datetime64(f"{year}-{month:>02}-{day:>02}T{_hour(hour, half):02}:{rest.replace(',', '.')}", "us").astype(int)
     )
     seconds *= 1e-6
-    if zone is None or zone.upper() in ("Z", "UTC"):
-        return seconds
-    hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
-    return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
+    if zone is None or zone.upper() in _ZONES:
+        return seconds - _ZONES[(zone or "Z").upper()] * 3600.0
+    sign, digits = -1 if "-" in zone else 1, re.sub(r"\D", "", zone)
+    hours, minutes = (digits[:-2], digits[-2:]) if len(digits) > 2 else (digits, 0)
+    return seconds - sign * (int(hours) * 3600.0 + int(minutes) * 60.0)
 
 
 def _hour(hour: str, half: str | None) -> int:

@@ -152,8 +152,12 @@ QUALITY = _words("quality qual fix q qf")
 BESIDE_QUALITY = _words("gps gnss position pos solution factor indicator")
 LINKING = _words("de du des del di der van of the")
 STDDEV = _words("stddev stdev std sigma sd rms uncertainty accuracy genauigkeit standardabweichung")
+IN_PLANE = {"x": frozenset({"horizontal"}), "y": frozenset({"horizontal"}), "z": frozenset({"vertical"})}
+"""Words in the names of standard deviations of several coordinates."""
 BIAS = _words("bias offset")
-PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
+PHOTO = _words(
+    "image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen imagename"
+)
 FILE = _words("file filename filenames name names path datei dateiname fichier nom source sourcefile archivo")
 # Words of a name of photos without an ending, and those beside them.
 NAMING_PHOTOS = (PHOTO, FILE | ID)
