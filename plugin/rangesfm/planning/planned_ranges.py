@@ -21,7 +21,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
 from rangesfm.measurements.ranges.scale.binned_ranges import in_bins
-from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions, fit_at
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale, bins_on
 from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
@@ -59,9 +59,8 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     noise_m = planned.given_sizes.get("white", START_STDDEV_M)
     stddev_m = np.sqrt(noise_m**2 + placing_m**2 + prior.shared_m**2)
     errors = replace(prior.at(tags_m, placing_m), stddev_m=stddev_m)
-    weighted = posed.weighted(errors)
-    fit = fit_at(weighted, state, np.full(len(posed.rows), float(planned.num_alike)))
-    return RangeScale.begun(RangesOnMap.at(posed, weighted, fit, errors, noise_m))
+    weights = np.full(len(posed.rows), float(planned.num_alike))
+    return RangeScale.begun(RangesOnMap.at(posed, state, weights, errors, noise_m))
 
 
 def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:

@@ -95,7 +95,6 @@ def small_map(
             notes=(),
             left_out=(),
         ),
-        weighted=problem,
         state=state,
         time_s=np.asarray(BEGIN_S + seconds),
         weights=np.ones(num),

@@ -126,7 +126,7 @@ def scale_per_anchor(on_map: RangesOnMap) -> dict[str, float]:
 
 def anchor_estimates(on_map: RangesOnMap, known: Posterior) -> tuple[AnchorEstimate, ...]:
     """Return the estimates of all anchors of the log, mirror places included, on the map moved to a posterior."""
-    problem, state, mirrors = on_map.weighted, on_map.state, _mirror_places(on_map)
+    problem, state, mirrors = on_map.problem, on_map.state, _mirror_places(on_map)
     common_bias_m, estimates = _common_bias(problem, state), []
     for k, (anchor_id, column) in enumerate(zip(on_map.anchor_ids, known.columns.anchor.tolist(), strict=True)):
         covariance_m2 = known.covariance[column : column + 3, column : column + 3] if column >= 0 else np.zeros((3, 3))
@@ -140,7 +140,7 @@ def anchor_estimates(on_map: RangesOnMap, known: Posterior) -> tuple[AnchorEstim
                 prior_position_stddev_m=float(problem.anchor_stddev_m[k]),
                 range_bias_m=float(state.bias_m[k] if heard else problem.bias_mean_m[k] + common_bias_m),
                 prior_bias_m=float(problem.bias_mean_m[k]),
-                prior_bias_stddev_m=float(problem.bias_stddev_m[k] * on_map.errors.inflation),
+                prior_bias_stddev_m=float(problem.bias_stddev_m[k]),
                 mirror_position_m=mirrors.get(k),
                 position_covariance_m2=covariance_m2,
             )

@@ -104,7 +104,7 @@ class RangeScale(KindOnMap):
             return self.solved.posed.given.beside(()).solved
         except GeometryError:
             is_free = problem.frame_is_free if problem.placement is None else problem.has_known_anchors
-        return self.solved.solved(lambda problem: replace(problem.without_others(), frame_is_free=is_free))
+        return self.solved.solved(replace(problem.without_others(), frame_is_free=is_free))
 
     def with_their_share(self) -> RangeScale:
         """Return the ranges solved beside other kinds with all of them weighted by how well they know the scale.
@@ -115,7 +115,8 @@ class RangeScale(KindOnMap):
         alone, known = self._without_others, self.alone.scale
         formal = alone.log_scale_stddev * alone.errors.inflation
         share = float(np.clip((formal * known.value / known.stddev) ** 2, ROUNDING, 1.0))
-        return replace(self, solved=self.solved.solved(lambda problem: replace(problem, share=share * problem.share)))
+        problem = self.solved.problem
+        return replace(self, solved=self.solved.solved(replace(problem, share=share * problem.share)))
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""

@@ -15,7 +15,7 @@ from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
-from rangesfm.measurements.ranges.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, predicted_ranges
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem, turns_and_velocities
@@ -113,6 +113,7 @@ class RangesAtRest(Located):
             posed.ranges,
             centers=model_from_path.apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            share=np.ones(len(tags_m)),
             distances=with_lengths(posed.ranges.distances, others, scale),
             placement=placement_by(others, model_from_path),
         )
@@ -129,10 +130,10 @@ class RangesAtRest(Located):
         ids, blocks = posed.observations.log.anchor_ids, self.state.blocks
         anchors_m, biases_m = np.array([blocks["anchor", id_] for id_ in ids]), [blocks["bias", id_][0] for id_ in ids]
         state = RangeState(placed, anchors_m, np.array(biases_m))
-        weighted, errors = posed.weighted(ranges.errors), ranges.errors
         off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
-        fit, noise_m = fit_at(weighted, state, errors.robust_weights(off_m)), float(np.median(errors.stddev_m))
-        return RangeScale(RangesOnMap.at(posed, weighted, fit, errors, noise_m), self.before.told, self.before.notes)
+        weights, noise_m = ranges.errors.robust_weights(off_m), float(np.median(ranges.errors.stddev_m))
+        here = RangesOnMap.at(posed, state, weights, ranges.errors, noise_m)
+        return RangeScale(here, self.before.told, self.before.notes)
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:

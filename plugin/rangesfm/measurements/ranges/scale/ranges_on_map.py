@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +16,6 @@ from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, 
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.range_equation import (
-    RangeFit,
     RangeProblem,
     RangeState,
     antenna_positions,
@@ -41,7 +40,6 @@ class RangesOnMap:
 
     Attributes:
         posed: their scale problem; corrected where a mistake is undone, and carried along where the map is bent.
-        weighted: the problem that was solved; its priors are scaled for ranges with independent errors.
         state: of the map and the anchors.
         time_s: (n,) as ``ScaleProblem.times_s``.
         weights: (n,) robust weights in the solution; larger than 1 for a range that stands for several.
@@ -53,7 +51,6 @@ class RangesOnMap:
     """
 
     posed: ScaleProblem
-    weighted: RangeProblem
     state: RangeState
     time_s: Array
     weights: Array
@@ -69,28 +66,33 @@ class RangesOnMap:
         return self.posed.ranges
 
     @property
+    def weighted(self) -> RangeProblem:
+        """The problem with the errors as its weights; its priors are scaled for ranges with independent errors."""
+        return self.posed.weighted(self.errors)
+
+    @property
     def log_scale_stddev(self) -> float:
         """Formal standard deviation of the logarithm of the scale."""
         return fit_at(self.weighted, self.state, self.weights).log_scale_stddev
 
     @classmethod
     def at(
-        cls, posed: ScaleProblem, weighted: RangeProblem, fit: RangeFit, errors: RangeErrors, noise_m: float
+        cls, posed: ScaleProblem, state: RangeState, weights: Array, errors: RangeErrors, noise_m: float
     ) -> RangesOnMap:
-        """Return the ranges at a fit of their weighted problem."""
-        times_s = posed.times_s(fit.state.metric_from_model.scale)
-        return cls(posed, weighted, fit.state, times_s, fit.weights, errors, noise_m, posed.given.bending)
-
-    def solved(self, change: Callable[[RangeProblem], RangeProblem]) -> RangesOnMap:
-        """Return the ranges at the solution of a problem that was changed, near their state, with the same errors."""
-        posed, weighted = replace(self.posed, ranges=change(self.posed.ranges)), change(self.weighted)
-        fit = solve(weighted, self.state, loss=self.errors.loss)
-        found = RangesOnMap.at(posed, weighted, fit, self.errors, self.noise_stddev_m)
-        return replace(found, rivals=self.rivals, why_open=self.why_open)
+        """Return the ranges at a state of the path on which they are posed."""
+        times_s = posed.times_s(state.metric_from_model.scale)
+        return cls(posed, state, times_s, weights, errors, noise_m, posed.given.bending)
 
     def with_problem(self, problem: RangeProblem) -> RangesOnMap:
         """Return the ranges with another problem of them, at the same state."""
         return replace(self, posed=replace(self.posed, ranges=problem))
+
+    def solved(self, problem: RangeProblem) -> RangesOnMap:
+        """Return the ranges at the solution of another problem of them, near their state, with the same errors."""
+        changed = self.with_problem(problem)
+        fit = solve(changed.weighted, self.state, loss=self.errors.loss)
+        times_s = changed.posed.times_s(fit.state.metric_from_model.scale)
+        return replace(changed, state=fit.state, time_s=times_s, weights=fit.weights)
 
     @property
     def anchor_ids(self) -> tuple[str, ...]:

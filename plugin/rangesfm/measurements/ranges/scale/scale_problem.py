@@ -116,7 +116,7 @@ class ScaleProblem:
         return replace(
             ranges,
             stddev_m=errors.stddev_m,
-            share=errors.share,
+            share=ranges.share * errors.share,
             bias_stddev_m=ranges.bias_stddev_m / inflation,
             common_bias_stddev_m=ranges.common_bias_stddev_m / inflation,
             distances=replace(distances, stddev_m=distances.stddev_m / inflation),

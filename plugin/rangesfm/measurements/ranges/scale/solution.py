@@ -186,14 +186,13 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> RangesOnMap:
         state = solve(posed.weighted(used).by_some(rows), state, loss=used.loss).state
         used = shown(used, state)
     for _ in range(MAX_NUM_ROUNDS):
-        weighted = posed.weighted(used)
-        fit = solve(weighted, state, loss=used.loss)
+        fit = solve(posed.weighted(used), state, loss=used.loss)
         last = shown(used, fit.state)
         # The first rounds may have taken garbage for noise, which the last fit does not any more.
         if last.noise_m > _FALLS * used.noise_m:
             break
         used, state = last, fit.state
-    return RangesOnMap.at(posed, weighted, fit, used, last.noise_m)
+    return RangesOnMap.at(posed, fit.state, fit.weights, used, last.noise_m)
 
 
 def with_unknown_anchors(on_map: RangesOnMap) -> RangesOnMap:
