@@ -41,7 +41,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
 from rangesfm.measurements.ranges.scale.range_start import RangesOnPath
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.measurements.ranges.scale.solution import solution_from
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
@@ -203,7 +203,7 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
 
     A whole run also has its stated stddev.
     """
-    observations, trajectory, anchors, distances = measured(planned, seed)
+    observations, trajectory, anchors, lengths = measured(planned, seed)
     found: Row = {}
     try:
         if is_whole:
@@ -214,15 +214,14 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
                 anchor_frame=planned.anchor_frame,
                 options=ScaleOptions(max_relative_stddev=0.5),
                 range_model=planned.range_model,
-                distances=distances,
-                others=lengths_among(distances, trajectory),
+                others=lengths_among(lengths, trajectory),
                 seed=seed,
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
         else:
             bending = WalkBending(trajectory)
-            given = (observations, bending, anchors, planned.anchor_frame, planned.range_model, distances)
-            posed = scale_problem(RangesOnPath(*given))
+            given = RangesOnPath(observations, bending, anchors, planned.anchor_frame, planned.range_model)
+            posed = given.posed(lengths_among(lengths, trajectory))
             solved = solution_from(posed, truth(planned, posed))
             metric_from_map = solved.state.metric_from_model @ first_camera_from(trajectory)
     except GeometryError as error:

@@ -23,11 +23,7 @@ from rangesfm.measurements.kind_as_read import KindAsRead
 from rangesfm.measurements.kind_words import KindWords
 from rangesfm.measurements.lengths.cost import taped_lengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
-from rangesfm.measurements.lengths.locate_lengths import (
-    NO_DISTANCES,
-    locate_distances,
-    surveyed_distances,
-)
+from rangesfm.measurements.lengths.locate_lengths import locate_distances, surveyed_distances
 from rangesfm.measurements.lengths.words import LENGTH_WORDS
 from rangesfm.measurements.planned_kind import PlannedKind
 from rangesfm.measurements.points import NamedPoints
@@ -35,6 +31,7 @@ from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.positions.words import POSITION_WORDS
+from rangesfm.measurements.ranges.anchors.anchor_distances import NO_DISTANCES
 from rangesfm.measurements.ranges.radio import measured_by_radio, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
@@ -81,7 +78,7 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
         ranges = ranges_of(at.rest.problem.kinds)
         return RangesAtRest(before, at.metres_per_unit, ranges, at.rest.state, at.bending)
     if inputs.tape.distances:
-        distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
+        distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids).between_anchors
     return RangesOnPath(
         *(at.observations, at.bending, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
         gravity=gravity_of(survey.scale.up_in_first_camera),

@@ -17,7 +17,7 @@ from rangesfm.demo.simulated_radio import Radio
 from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
@@ -85,11 +85,15 @@ class Survey:
         return associate(log or self.log, self.trajectory, self.tag_in_cam_m)
 
     def scale(
-        self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
+        self,
+        frame: str,
+        known: Collection[str] = (),
+        log: RangeLog | None = None,
+        lengths: LocatedDistances | None = None,
+        **options: Any,
     ) -> ScaleEstimate:
-        """Run the scale stage on this survey's ranges, or on another log."""
-        anchors, distances = self.anchors(frame, known), options.get("distances", NO_DISTANCES)
-        others = lengths_among(distances, self.trajectory)
+        """Run the scale stage on this survey's ranges, or on another log, with lengths between points."""
+        anchors, others = self.anchors(frame, known), [] if lengths is None else lengths_among(lengths, self.trajectory)
         observations = self.observations(log)
         return initialize_scale(observations, self.trajectory, anchors, anchor_frame=frame, others=others, **options)
 

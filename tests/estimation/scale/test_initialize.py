@@ -24,6 +24,7 @@ from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
+from rangesfm.measurements.ranges.anchors.anchor_distances import AnchorDistances
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
@@ -341,12 +342,12 @@ def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.
     return LocatedDistances.between_points(metric, np.full(2, stddev_m), model)
 
 
-def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances:
+def between_anchors(survey: Survey, stddev_m: float = 0.005) -> AnchorDistances:
     """The true distance from the first anchor to every other."""
     places = np.array(list(survey.anchors_m.values()))
     pairs = np.array([[0, k] for k in range(1, len(places))])
     lengths = np.linalg.norm(places[1:] - places[0], axis=1)
-    return LocatedDistances.between_anchors(lengths, np.full(len(lengths), stddev_m), pairs)
+    return AnchorDistances(pairs, lengths, np.full(len(lengths), stddev_m))
 
 
 def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_spoil(make_survey: MakeSurvey) -> None:
@@ -354,33 +355,30 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     long = survey.log_with(survey.log.range_m * 1.04)
     truth = survey.truth("first_camera").scale
     alone = survey.scale("unknown", log=long)
-    held = survey.scale("unknown", log=long, distances=between_cameras(survey))
+    held = survey.scale("unknown", log=long, lengths=between_cameras(survey))
     assert abs(alone.value / truth - 1) > 0.02
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
     # The judged problem holds the scale no better than the lengths do in a map that bends.
-    lengths, posed = (
-        known(find_kind(held.on_map.kinds, LengthScale)),
-        known(find_kind(held.on_map.kinds, RangeScale)).solved.problem.distances,
-    )
-    assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
+    [by_lengths] = known(find_kind(held.on_map.kinds, RangeScale)).solved.problem.scales
+    assert by_lengths == known(find_kind(held.on_map.kinds, LengthScale)).alone.scale
 
 
 @pytest.mark.parametrize("wrong", [0, 1])
 def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wrong: int) -> None:
     survey = make_survey(radio=NOISE, num_epochs=2)
-    distances = between_cameras(survey)
-    mistyped = replace(distances, distance_m=distances.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
-    found = survey.scale("unknown", distances=mistyped)
+    lengths = between_cameras(survey)
+    mistyped = replace(lengths, distance_m=lengths.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
+    found = survey.scale("unknown", lengths=mistyped)
     low, high = found.interval_95
     np.testing.assert_array_equal(known(find_kind(found.on_map.kinds, LengthScale)).is_kept, np.arange(2) != wrong)
     assert low < survey.truth("first_camera").scale < high
-    assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
+    assert found.value == pytest.approx(survey.scale("unknown", lengths=lengths).value, rel=0.005)
 
 
 def test_lengths_in_feet_do_not_mislead_the_scale_by_the_ranges_alone(make_survey: MakeSurvey) -> None:
     survey = make_survey(radio=NOISE)
-    found = survey.scale("unknown", distances=between_cameras(survey, factor=1 / 0.3048))
+    found = survey.scale("unknown", lengths=between_cameras(survey, factor=1 / 0.3048))
     alone = survey.scale("unknown")
     assert found.by_kind["lengths"].value == pytest.approx(alone.value / 0.3048, rel=0.02)
     assert found.by_kind["ranges"] == alone.on_map.scale

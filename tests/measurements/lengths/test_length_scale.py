@@ -15,7 +15,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
-from rangesfm.measurements.ranges.scale.range_start import with_lengths
+from rangesfm.measurements.ranges.scale.range_start import scales_by
 from rangesfm.solver.bending import Bending, MapBending, bending_parts
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component
@@ -138,7 +138,7 @@ def test_the_other_kinds_tell_whether_a_single_length_is_wrong(rng: np.random.Ge
     mistyped = replace(honest, distance_m=1.09 * honest.distance_m)
     left_out = scaled(mistyped, path, [other("ranges"), other("positions")])
     assert not left_out.is_used
-    assert len(known(with_lengths(mistyped, [left_out]))) == 0
+    assert not scales_by([left_out])
     assert left_out.errors[0].sizes[0] == pytest.approx(0.09 * honest.distance_m[0], rel=0.2)
     assert scaled(mistyped, path, [other("ranges")]).is_used
     assert scaled(honest, path, [other("ranges"), other("positions", 0.09)]).is_used
@@ -227,16 +227,22 @@ def test_a_length_depends_on_the_poses_of_its_ends(rng: np.random.Generator) -> 
     np.testing.assert_allclose(by_pose[:, :, 3:].sum(axis=1), 0.0, atol=1e-12)
 
 
-def test_beside_ranges_one_length_stands_for_all_between_points(rng: np.random.Generator) -> None:
+def test_beside_ranges_the_scale_by_them_stands_for_all_lengths_between_points(rng: np.random.Generator) -> None:
     path = walked(rng)
     lengths = scaled(located(path, 2, rng), path)
-    lengths_m, stddevs_m = np.array([2.0, 7.0, 3.0]), np.array([0.1, 0.2, 0.3])
-    taped = LocatedDistances.between_points(lengths_m, stddevs_m, np.array([4.0, np.nan, 6.0]))
-    taped = replace(taped, anchor_pair=np.array([[-1, -1], [0, 1], [-1, -1]]))
-    beside, alone = known(with_lengths(taped, [lengths])), lengths.alone.scale
-    np.testing.assert_allclose(beside.distance_m, [alone.value, 7.0])
-    np.testing.assert_allclose(beside.stddev_m, [alone.stddev, 0.2])
-    np.testing.assert_array_equal(beside.model_length, [1.0, np.nan])
-    np.testing.assert_array_equal(beside.anchor_pair, [[-1, -1], [0, 1]])
-    assert known(with_lengths(taped, [lengths], 3.0)).distance_m[0] == pytest.approx(3 * alone.value)
-    assert len(known(with_lengths(taped, [replace(lengths, is_kept=np.zeros(2, dtype=bool))]))) == 1
+    alone = lengths.alone.scale
+    assert scales_by([lengths]) == (alone,)
+    [in_other_unit] = scales_by([lengths], 3.0)
+    assert in_other_unit.value == pytest.approx(3 * alone.value)
+    assert in_other_unit.stddev == pytest.approx(3 * alone.stddev)
+    assert not scales_by([replace(lengths, is_kept=np.zeros(2, dtype=bool))])
+
+
+def test_beside_ranges_control_lengths_between_anchors_are_used_one_by_one() -> None:
+    nothing, stddevs_m = np.full(4, np.nan), np.array([0.1, 0.2, 0.3, 0.4])
+    taped = LocatedDistances.between_points(np.array([2.0, 7.0, 3.0, 4.0]), stddevs_m, nothing)
+    pairs, is_check = np.array([[-1, -1], [0, 1], [2, 1], [0, 2]]), np.array([False, False, True, False])
+    found = replace(taped, anchor_pair=pairs, is_check=is_check).between_anchors
+    np.testing.assert_array_equal(found.anchor_pair, [[0, 1], [0, 2]])
+    np.testing.assert_array_equal(found.distance_m, [7.0, 4.0])
+    np.testing.assert_array_equal(found.stddev_m, [0.2, 0.4])

@@ -22,8 +22,8 @@ from rangesfm.measurements.joint_map import (
     place_first,
     tested_kinds,
 )
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_distances import NO_DISTANCES, AnchorDistances
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
@@ -47,7 +47,7 @@ def initialize_scale(
     anchor_frame: str,
     options: ScaleOptions = ScaleOptions(),
     range_model: RangeModelOptions = RangeModelOptions(),
-    distances: LocatedDistances = NO_DISTANCES,
+    distances: AnchorDistances = NO_DISTANCES,
     others: Sequence[Located] = (),
     bending: MapBending | None = None,
     site: Site = Site(),
@@ -62,7 +62,7 @@ def initialize_scale(
         anchor_frame: "site" (positions in a site frame: the map is carried there), "first_camera" (positions in the
             first keyframe's camera frame, metres) or "unknown" (positions are ignored; the map stays in the first
             camera's frame).
-        distances: measured ones, of which those between anchors are used beside ranges.
+        distances: measured ones between anchors, by their indices in the log.
         others: measurements of other kinds on ``trajectory``, those first that decide what is doubtful.
         bending: how the map is bent; None: it drifts as a map of poses does.
         site: frame of the anchors' positions.

@@ -6,11 +6,10 @@ import itertools
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
@@ -18,7 +17,7 @@ from rangesfm.measurements.kind import by_all_poses
 from rangesfm.measurements.lengths.tape import CONTROL, Tape, TapedDistance
 from rangesfm.measurements.points import NamedPoints, images_by_name, variance_along
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
-from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.anchors.anchor_distances import AnchorDistances
 from rangesfm.util.geometry.map_errors import MapPoint
 
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
@@ -59,21 +58,16 @@ class LocatedDistances:
         no, pair = np.zeros(k, dtype=bool), np.full((k, 2), -1, dtype=np.int64)
         return cls(model_length, pair, distance_m, stddev_m, no, np.zeros(k), no, csr_array((k, 0)))
 
-    @classmethod
-    def between_anchors(cls, distance_m: Array, stddev_m: Array, anchor_pair: Indices) -> LocatedDistances:
-        """Make control lengths between anchors."""
-        unknown = np.full(len(distance_m), np.nan)
-        return replace(cls.between_points(distance_m, stddev_m, unknown), anchor_pair=anchor_pair)
-
     @property
     def is_between_points(self) -> Mask:
         """Lengths between points of the model, not anchors, (k,)."""
         return np.asarray(self.anchor_pair[:, 0] < 0)
 
     @property
-    def of_anchors(self) -> LocatedDistances:
-        """Those between anchors."""
-        return self.subset(~self.is_between_points)
+    def between_anchors(self) -> AnchorDistances:
+        """Those between anchors that take part in the estimate."""
+        rows = ~self.is_between_points & ~self.is_check
+        return AnchorDistances(self.anchor_pair[rows], self.distance_m[rows], self.stddev_m[rows])
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -81,17 +75,6 @@ class LocatedDistances:
     def subset(self, rows: Mask) -> LocatedDistances:
         """Return the lengths that are true in ``rows`` (k,)."""
         return LocatedDistances(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
-
-    def joined(self, others: LocatedDistances) -> LocatedDistances:
-        """Return these lengths followed by others."""
-        columns = dict[str, Any](
-            (field.name, np.concatenate([getattr(self, field.name), getattr(others, field.name)]))
-            for field in fields(self)
-            if field.name != "by_pose"
-        )
-        num = max(self.by_pose.shape[1], others.by_pose.shape[1])
-        parts = [csr_array(of.by_pose, shape=(len(of), num)) for of in (self, others)]
-        return LocatedDistances(**columns, by_pose=vstack(parts, format="csr"))
 
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
         """Return the lengths in a map (k,), in metres; NaN where an anchor has no position.
@@ -105,31 +88,6 @@ class LocatedDistances:
         first, second = anchors_m[self.anchor_pair[between_anchors].T]
         lengths[between_anchors] = np.linalg.norm(first - second, axis=1)
         return lengths
-
-    def residuals(self, scale: float, anchors_m: Array) -> Array:
-        """Return the (k,) residuals in such a map, predicted minus measured, in standard deviations."""
-        return (self.lengths_m(scale, anchors_m) - self.distance_m) / self.stddev_m
-
-    def jacobian(self, scale: float, anchors_m: Array, anchor_column: Indices, num_columns: int) -> Array:
-        """Return the (k, p) Jacobian of the residuals.
-
-        Args:
-            anchor_column: (m,) first of the three columns of each anchor; -1 for an anchor that is held fixed.
-            num_columns: p; the first column is the logarithm of the scale.
-        """
-        jacobian, between_points = np.zeros((len(self), num_columns)), self.is_between_points
-        jacobian[between_points, 0] = (scale * self.model_length / self.stddev_m)[between_points]
-        rows = np.flatnonzero(~between_points)
-        first, second = self.anchor_pair[rows].T
-        by = RangeGradient.of(anchors_m[first] - anchors_m[second])
-        for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
-            free = anchor_column[anchor] >= 0
-            columns = anchor_column[anchor[free], None] + np.arange(3)
-            jacobian[rows[free, None], columns] = slopes[free] / self.stddev_m[rows[free], None]
-        return jacobian
-
-
-NO_DISTANCES = LocatedDistances.between_points(*np.zeros((3, 0)))
 
 
 def locate_distances(

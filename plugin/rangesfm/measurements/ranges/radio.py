@@ -10,10 +10,10 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths.cost import Lengths
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.anchors.anchor_distances import AnchorDistances
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
@@ -88,7 +88,7 @@ def _between_anchors(ranges: Ranges, points: NamedPoints) -> Lengths:
 
 def lengths_by_radio(
     log: RangeLog, noise_m: float, bias_m: Array, bias_stddev_m: Array, common_bias_stddev_m: float
-) -> LocatedDistances:
+) -> AnchorDistances:
     """Return one length for each pair of anchors that ranged: the median of their ranges in both directions.
 
     All ranges of a pair share the error from the same delays and reflections, so that many are hardly better than one.
@@ -113,7 +113,7 @@ def lengths_by_radio(
     variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
     variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2
     corrected_m = medians - (bias_m[first] + bias_m[second]) / 2
-    return LocatedDistances.between_anchors(corrected_m, np.sqrt(variance), pairs.reshape(-1, 2))
+    return AnchorDistances(pairs.reshape(-1, 2), corrected_m, np.sqrt(variance))
 
 
 def ranges_of(kinds: Sequence[Measurements]) -> Ranges:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.ranges.anchors.anchor_distances import AnchorDistances
 from rangesfm.measurements.ranges.scale import range_equation
 from rangesfm.measurements.ranges.scale.range_equation import (
     RangeFit,
@@ -20,6 +20,7 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     predicted_ranges,
     solve,
 )
+from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.robust_statistics import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.util.geometry.similarity import Similarity
@@ -93,10 +94,9 @@ def test_prediction_is_the_hand_computed_one() -> None:
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-5, 0.5, 2.5])
 def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generator, turn_rad: float) -> None:
     start = random_state(rng)
-    lengths_m, stddevs_m = np.array([3.0, 5.0, 4.0]), np.array([0.1, 0.2, 0.5])
-    taped = LocatedDistances.between_points(lengths_m, stddevs_m, np.array([2.0, np.nan, np.nan]))
-    taped = replace(taped, anchor_pair=np.array([[-1, -1], [0, 1], [2, 1]]))
-    problem = replace(random_problem(rng, random_state(rng)), distances=taped, gravity=gravity_of((0.3, -1.0, 0.2)))
+    taped = AnchorDistances(np.array([[0, 1], [2, 1]]), np.array([5.0, 4.0]), np.array([0.2, 0.5]))
+    given, scales = random_problem(rng, random_state(rng)), (ScaleByKind(1.5, 0.1), ScaleByKind(2.5, 0.3))
+    problem = replace(given, distances=taped, gravity=gravity_of((0.3, -1.0, 0.2)), scales=scales)
     (columns,) = range_equation.columns_of([problem])
     assert columns.num == 1 + 6 + 3 * NUM_ANCHORS + NUM_ANCHORS
     at = 0.2 * rng.normal(size=columns.num)

@@ -18,7 +18,6 @@ from scipy.optimize import brentq
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.point_fit import likeliest_state
 from rangesfm.measurements.ranges.errors.noise import MIN_NUM_OF_SCATTER, START_STDDEV_M
@@ -40,6 +39,7 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.solver.linear_map import Solved
 from rangesfm.solver.noise import Component
+from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP, SAME_COST
@@ -277,7 +277,7 @@ def _on_given_path(
         frame_is_free=False,
         share=errors.share,
         # Nothing depends on the scale of a camera that stands still, and this keeps it as it is.
-        distances=LocatedDistances.between_points(*np.ones((3, 1))),
+        scales=(ScaleByKind(1.0, 1.0),),
     )
     given = RangesOnPath(observations, WalkBending(still), (), "unknown", model)
     upright = np.tile(np.eye(3), (len(rows), 1, 1))

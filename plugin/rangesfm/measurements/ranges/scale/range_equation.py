@@ -20,11 +20,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
+from rangesfm.measurements.ranges.anchors.anchor_distances import NO_DISTANCES, AnchorDistances
 from rangesfm.measurements.ranges.errors.noise import bias_whitening
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
@@ -53,7 +54,8 @@ class RangeProblem:
         share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike.
         gravity: the upward direction, if given and the frame is free; None otherwise.
         placement: what known positions say of the frame, if it is free; None without any.
-        distances: measured ones to fit; they refer to anchors by index, like ``anchor_index``.
+        scales: by other kinds alone, metres per unit of the model, as priors.
+        distances: measured ones between anchors to fit; they refer to these by index, like ``anchor_index``.
     """
 
     centers: Array
@@ -68,9 +70,10 @@ class RangeProblem:
     common_bias_stddev_m: float
     frame_is_free: bool
     share: Array
-    distances: LocatedDistances = NO_DISTANCES
+    distances: AnchorDistances = NO_DISTANCES
     gravity: Gravity | None = None
     placement: PlacementPrior | None = None
+    scales: tuple[ScaleByKind, ...] = ()
 
     @property
     def num_anchors(self) -> int:
@@ -115,11 +118,11 @@ class RangeProblem:
         return replace(part, share=part.share * (num / np.maximum(taken, 1))[part.anchor_index])
 
     def without_others(self) -> RangeProblem:
-        """Return the problem without lengths in the map and known positions.
+        """Return the problem without what other kinds say of the map.
 
-        They help to solve it, and are observations of their own beside the ranges.
+        It helps to solve it, and they are observations of their own beside the ranges.
         """
-        return replace(self, distances=self.distances.of_anchors, placement=None)
+        return replace(self, placement=None, scales=())
 
     def of_anchor(self, k: int) -> RangeProblem:
         """Return the problem of the ranges to anchor k alone, with a fixed frame."""
@@ -133,6 +136,7 @@ class RangeProblem:
             bias_stddev_m=self.bias_stddev_m[one],
             frame_is_free=False,
             distances=NO_DISTANCES,
+            scales=(),
         )
 
 
@@ -421,13 +425,13 @@ def range_jacobian(problem: RangeProblem, columns: Columns, state: RangeState, b
 
 
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
-    """Return the (r,) residuals of anchors, biases, distances, gravity and known positions, in standard deviations."""
+    """Return the (r,) residuals of anchors, biases, scales, distances, gravity and placement, in stddevs."""
     anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_anchor = off_anchor[~np.isnan(off_anchor)]
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
-    of_distances = problem.distances.residuals(state.metric_from_model.scale, state.anchors_m)
-    priors = [off_anchor, off_bias, of_distances]
+    off_scale = [(state.metric_from_model.scale - each.value) / each.stddev for each in problem.scales]
+    priors = [off_anchor, off_bias, np.array(off_scale), problem.distances.residuals(state.anchors_m)]
     if problem.gravity is not None and columns.frame >= 0:
         priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
     if problem.placement is not None and columns.frame >= 0:
@@ -436,7 +440,7 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
 
 
 def prior_cost(problem: RangeProblem, state: RangeState) -> float:
-    """Return half the sum of squares of the residuals of priors, distances and gravity."""
+    """Return half the sum of squares of ``prior_residuals``."""
     off = prior_residuals(problem, columns_of([problem])[0], state)
     return 0.5 * float(off @ off)
 
@@ -450,8 +454,9 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, state: RangeState, b
     jacobian[np.arange(len(known)), column] = 1 / problem.anchor_stddev_m[anchors[known]]
     jacobian[len(known) :, columns.bias[biases]] = problem.bias_whitening
     similarity = state.metric_from_model
-    of_distances = problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num)
-    blocks = [jacobian, of_distances]
+    by_scale = np.zeros((len(problem.scales), columns.num))
+    by_scale[:, columns.scale] = [similarity.scale / each.stddev for each in problem.scales]
+    blocks = [jacobian, by_scale, problem.distances.jacobian(state.anchors_m, columns.anchor, columns.num)]
     if problem.gravity is not None and columns.frame >= 0:
         block = np.zeros((3, columns.num))
         turn = problem.gravity.jacobian(similarity.rotation, by_turn)

@@ -97,7 +97,7 @@ class RangeScale(KindOnMap):
     @cached_property
     def _without_others(self) -> RangesOnMap:
         problem = self.solved.problem
-        if problem.placement is None and not problem.distances.is_between_points.any():
+        if problem.placement is None and not problem.scales:
             return self.solved
         # Others that are wrong may have led the ranges to where they no longer find back.
         try:

@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.measurements.joint_map import KindOnMap, Located, upward_by
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_distances import NO_DISTANCES, AnchorDistances
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.range_observations import RangeObservations
@@ -23,6 +23,7 @@ from rangesfm.measurements.ranges.scale.solution import solution_from, solve_sca
 from rangesfm.measurements.ranges.words import RANGES
 from rangesfm.options import RangeModelOptions
 from rangesfm.solver.bending import MapBending
+from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import first_camera_from, moved_similarity
@@ -41,8 +42,7 @@ class RangesOnPath(Located):
         anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
             keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
         range_model: what is assumed of the radio.
-        distances: measured ones, with the anchors of the log in its order; those measured by radio between anchors are
-            in the log.
+        distances: measured ones between the anchors of the log, in its order; those measured by radio are in the log.
         gravity: the upward direction in the first camera; None if it is not known.
         camera_side: side of the anchors' plane on which the camera was, as in the scale options; None if not known.
         site: frame of the anchors' positions here, from which texts get the coordinates in their file.
@@ -54,7 +54,7 @@ class RangesOnPath(Located):
     anchors: Sequence[Anchor]
     anchor_frame: str
     range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
-    distances: LocatedDistances = NO_DISTANCES
+    distances: AnchorDistances = NO_DISTANCES
     gravity: Gravity | None = None
     camera_side: str | None = None
     site: Site = field(default_factory=Site)
@@ -64,11 +64,9 @@ class RangesOnPath(Located):
 
     def posed(self, others: Sequence[KindOnMap], *, place_is_open: bool = False) -> ScaleProblem:
         """Return their problem beside the other kinds; argument and errors as of ``scale_problem``."""
-        distances, gravity = with_lengths(self.distances, others), upward_by(others, self.gravity)
+        given = replace(self, gravity=upward_by(others, self.gravity))
         placement = placement_by(others, first_camera_from(self.bending.path))
-        return scale_problem(
-            replace(self, distances=distances, gravity=gravity), placement, place_is_open=place_is_open
-        )
+        return scale_problem(given, placement, scales_by(others), place_is_open=place_is_open)
 
     def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
         """Return the ranges at the best solution of their problem.
@@ -114,8 +112,8 @@ class RangesAtRest(Located):
             centers=model_from_path.apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
             share=np.ones(len(tags_m)),
-            distances=with_lengths(posed.ranges.distances, others, scale),
             placement=placement_by(others, model_from_path),
+            scales=scales_by(others, scale),
         )
         unscaled = path.transformed(Similarity(1 / scale, np.eye(3), np.zeros(3)))
         turns, velocity = turns_and_velocities(posed.observations, posed.rows, unscaled)
@@ -153,19 +151,13 @@ def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarit
     return None
 
 
-def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit: float = 1.0) -> LocatedDistances:
-    """Return distances between anchors with one length in the map for each other kind that gives its scale alone.
+def scales_by(others: Sequence[KindOnMap], unit: float = 1.0) -> tuple[ScaleByKind, ...]:
+    """Return the scale by each other kind that gives the map nothing else.
 
-    With them the problem of the ranges is solved and tested.
+    The problem of the ranges is solved and tested with them.
 
     Args:
-        unit: of the model to which the distances refer, in units of that of the other kinds.
+        unit: of the model of the problem, in units of that of the other kinds.
     """
-    found = distances.of_anchors
-    one = np.ones(1)
-    for each in others:
-        if each.is_used and not each.places_map:
-            alone = each.alone.scale
-            length = LocatedDistances.between_points(unit * alone.value * one, unit * alone.stddev * one, one)
-            found = length.joined(found)
-    return found
+    alone = [each.alone.scale for each in others if each.is_used and not each.places_map]
+    return tuple(ScaleByKind(unit * each.value, unit * each.stddev) for each in alone)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -11,8 +10,9 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.measurements.lengths.locate_lengths import LocatedDistances, surveyed_distances
+from rangesfm.measurements.lengths.locate_lengths import surveyed_distances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_distances import AnchorDistances
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import lengths_by_radio
@@ -20,6 +20,7 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_steep
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
+from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, OnPath, Trajectory, first_camera_from
@@ -122,17 +123,23 @@ class ScaleProblem:
             distances=replace(distances, stddev_m=distances.stddev_m / inflation),
             gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
             placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
+            scales=tuple(replace(each, stddev=each.stddev / inflation) for each in ranges.scales),
         )
 
 
 def scale_problem(
-    given: RangesOnPath, placement: PlacementPrior | None = None, *, place_is_open: bool = False
+    given: RangesOnPath,
+    placement: PlacementPrior | None = None,
+    scales: tuple[ScaleByKind, ...] = (),
+    *,
+    place_is_open: bool = False,
 ) -> ScaleProblem:
     """Set up the range problem.
 
     Args:
         given: the ranges.
         placement: what known positions say of the map's place, for the first camera's frame; None without any.
+        scales: of the map by other kinds alone, metres per unit.
         place_is_open: whether the map has more than one possible place in the site. Then only the distances between
             surveyed anchors are used, not their positions.
 
@@ -155,13 +162,12 @@ def scale_problem(
     bias_m = np.array([a.range_bias_m for a in in_log])
     stddevs_m = (a.range_bias_stddev_m for a in in_log)
     bias_stddev_m = np.array([range_model.range_bias_stddev_m if each is None else each for each in stddevs_m])
-    measured = [given.distances]
-    if anchor_frame == "site" and not known.any():
-        measured += _between_surveyed(in_log, surveyed & heard)
+    distances, in_site = given.distances, anchor_frame == "site" and bool(known.any())
+    if anchor_frame == "site" and not in_site:
+        distances = distances.joined(_between_surveyed(in_log, surveyed & heard))
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
-    measured.append(lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
-    distances = functools.reduce(LocatedDistances.joined, measured)
-    has_ends = np.append(heard | placed, True)[distances.anchor_pair].all(axis=1)  # the last is for points, of index -1
+    distances = distances.joined(lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
+    has_ends = np.asarray((heard | placed)[distances.anchor_pair].all(axis=1))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], path),
@@ -169,18 +175,17 @@ def scale_problem(
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=errors.stddev_m,
-        anchor_mean_m=np.array(
-            [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
-        ),
+        anchor_mean_m=np.where(placed[:, None], np.array([_position(a) for a in in_log]), np.nan),
         anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
         bias_mean_m=bias_m,
         bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
         common_bias_stddev_m=common_stddev_m,
-        frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
+        frame_is_free=in_site or placement is not None,
         share=errors.share,
-        distances=distances.subset(has_ends & ~distances.is_check),
-        gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
+        distances=distances.subset(has_ends),
+        gravity=given.gravity if in_site else None,
         placement=placement,
+        scales=scales,
     )
     turns, velocity = turns_and_velocities(observations, rows, path)
     return ScaleProblem(given, ranges, first_camera_from(path), turns, velocity, rows, tuple(notes), left_out)
@@ -269,10 +274,10 @@ def _usable_positions(
     return np.zeros(len(anchors), dtype=bool), [note]
 
 
-def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDistances]:
+def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> AnchorDistances:
     """Return the distances between anchors with given positions; they hold in any frame."""
     ids = [anchor.anchor_id for anchor in anchors]
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
-    ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs])
-    return [LocatedDistances.between_anchors(lengths_m, stddevs_m, ends)] if pairs else []
+    ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    return AnchorDistances(ends, lengths_m, stddevs_m)

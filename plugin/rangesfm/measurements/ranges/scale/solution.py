@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.measurements.ranges.anchors.anchor_distances import NO_DISTANCES
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
 from rangesfm.measurements.ranges.errors.noise import shared_stddev
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
@@ -140,13 +141,13 @@ def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
 
 def _known_only(problem: RangeProblem) -> RangeProblem:
     """Return the ranges to anchors with a given position; all other anchors are held fixed."""
-    known, distances = np.isfinite(problem.anchor_stddev_m), problem.distances
+    known = np.isfinite(problem.anchor_stddev_m)
     part = problem.subset(np.flatnonzero(known[problem.anchor_index]))
     return replace(
         part,
         anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
         bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
-        distances=distances.subset(distances.is_between_points),
+        distances=NO_DISTANCES,
     )
 
 
