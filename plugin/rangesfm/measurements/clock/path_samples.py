@@ -16,8 +16,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.measurements.clock.offset import OffsetCurve
-from rangesfm.measurements.ranges.association import places_on_path
-from rangesfm.options import RangesOptions
+from rangesfm.measurements.places import places_on_path
 from rangesfm.util.geometry.similarity import rounding_of
 from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around, places_in_time
 
@@ -86,11 +85,12 @@ class PathSamples:
         return here + (place - before)[:, None] * step, step / self.step_s
 
 
-def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: RangesOptions, remedy: str) -> PathSamples:
+def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, max_gap_s: float, remedy: str) -> PathSamples:
     """Sample the path of keyframes with times, also across longer gaps than those in which observations are used.
 
     Args:
-        antennas_in_cam_m: (num, 3) lever arms, metres. remedy: what the user can do if no part of the path is known.
+        antennas_in_cam_m: (num, 3) lever arms, metres. max_gap_s: longest gap in which observations are used.
+        remedy: what the user can do if no part of the path is known.
 
     Raises:
         GeometryError: poses can be interpolated nowhere.
@@ -98,17 +98,16 @@ def moving_path(trajectory: Trajectory, antennas_in_cam_m: Array, options: Range
     keyframes_s = trajectory.times_s
     start_s, step_s, num = _steps(keyframes_s, 0.0)
     times_s: Array = start_s + step_s * np.arange(num, dtype=np.float64)
-    gap_s = max(_MAX_GAPS * float(np.median(np.diff(keyframes_s))), options.max_interpolation_gap_s)
+    gap_s = max(_MAX_GAPS * float(np.median(np.diff(keyframes_s))), max_gap_s)
     at = places_in_time(times_s, keyframes_s, max_gap_s=gap_s, max_difference_s=-1.0)
     is_known = at.before >= 0
     num_known = int(np.count_nonzero(is_known))
     if num_known < 2:
         raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {remedy}")
-    options = options.model_copy(update={"max_interpolation_gap_s": gap_s})
     centers, arms_m = np.zeros((num, 3)), np.zeros((len(antennas_in_cam_m), num, 3))
     for own_m, arm_m in zip(arms_m, antennas_in_cam_m, strict=True):
         own = np.tile(arm_m, (num_known, 1))
-        places = places_on_path(trajectory, own, at.subset(is_known), time_resolution_s=0.0, options=options)
+        places = places_on_path(trajectory, own, at.subset(is_known), max_gap_s=gap_s, time_resolution_s=0.0)
         centers[is_known], own_m[is_known] = places.centers, places.tag_from_center
     return PathSamples(start_s, step_s, centers, arms_m, is_known)
 

@@ -10,10 +10,9 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.clock.offset import TimeOffset
 from rangesfm.measurements.kind import by_all_poses
-from rangesfm.measurements.places import AntennaPlaces
+from rangesfm.measurements.places import AntennaPlaces, places_on_path
 from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.measurements.positions.position_log import PositionLog
-from rangesfm.measurements.ranges.association import places_on_path
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.clock_times import time_text
 from rangesfm.util.files.photo_names import rows_of_photos
@@ -63,7 +62,8 @@ def locate_antenna(track: AntennaTrack, path: Trajectory) -> KnownPositions:
     k, times_s, at, velocity = len(rows), path.timestamps_s, everywhere.subset(rows), np.zeros((len(rows), 3))
     arms_m = np.tile(track.antenna_in_cam_m, (k, 1))
     # The times of positions are those of a system's own epochs, so that they are exact.
-    on_path = places_on_path(path, arms_m, at, time_resolution_s=0.0, options=track.association)
+    max_gap_s = track.association.max_interpolation_gap_s
+    on_path = places_on_path(path, arms_m, at, max_gap_s=max_gap_s, time_resolution_s=0.0)
     if times_s is None or len(path) < 2:
         at_s = at.before.astype(np.float64)
     else:

@@ -124,7 +124,8 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         raise InputError("the positions have times but the photos have none: give image times", track.log.path)
     try:
         require_enough(path, len(track.log), TimedPositions)
-        samples = moving_path(path, track.antenna_in_cam_m[None], track.association, TimedPositions.remedy)
+        max_gap_s = track.association.max_interpolation_gap_s
+        samples = moving_path(path, track.antenna_in_cam_m[None], max_gap_s, TimedPositions.remedy)
         positions = TimedPositions(moments.timestamp_s, samples, track.log.position_m)
         found = offset_of_motion(positions)
     except GeometryError:

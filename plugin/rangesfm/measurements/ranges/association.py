@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
-from rangesfm.measurements.places import PlacesOnPath
+from rangesfm.measurements.places import places_on_path
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.options import RangesOptions
 from rangesfm.util.files.photo_names import rows_of_photos
 from rangesfm.util.geometry.moments import ByPhoto
-from rangesfm.util.geometry.motion_prior import learn_motion
 from rangesfm.util.geometry.robust_statistics import robust_stddev
-from rangesfm.util.geometry.trajectory import ROUNDING_S, OnPath, Trajectory, keyframes_around, places_in_time
+from rangesfm.util.geometry.trajectory import OnPath, Trajectory, is_too_long, keyframes_around, places_in_time
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 # The early and the late half of a burst must agree to this many standard deviations for the camera to count as still.
@@ -74,43 +72,9 @@ def associate(
     at = at.moved(status != RangeStatus.USED, -1)
     # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
-    resolution_s = log.time_resolution_s
-    places = places_on_path(trajectory, tags_in_cam_m, at, time_resolution_s=resolution_s, options=options)
+    max_gap_s, resolution_s = options.max_interpolation_gap_s, log.time_resolution_s
+    places = places_on_path(trajectory, tags_in_cam_m, at, max_gap_s=max_gap_s, time_resolution_s=resolution_s)
     return RangeObservations(**vars(places), log=log, status=status)
-
-
-def is_too_long(gaps_s: npt.ArrayLike, options: RangesOptions) -> Mask:
-    """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
-    return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
-
-
-def places_on_path(
-    trajectory: Trajectory,
-    arms_in_cam_m: Array,
-    at: OnPath,
-    *,
-    time_resolution_s: float,
-    options: RangesOptions,
-) -> PlacesOnPath:
-    """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
-
-    Args:
-        arms_in_cam_m: (n, 3) lever arms. at: -1 for a moment without a place.
-        time_resolution_s: step to which the moments were rounded.
-    """
-    rows, num = np.flatnonzero(at.before >= 0), len(at.before)
-    own, arms_m = at.subset(rows), np.full((num, 3), np.nan)
-    centers, offsets, stddev, arm_stddev_m = arms_m.copy(), np.zeros((num, 3)), np.zeros(num), np.zeros(num)
-    if trajectory.timestamps_s is None or len(trajectory) < 2:
-        arms_m[rows] = np.einsum("nij,nj->ni", trajectory.world_from_cam[own.before], arms_in_cam_m[rows])
-    else:
-        is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
-        arms_m[rows], arm_stddev_m[rows] = _interpolated_lever_arms(trajectory, arms_in_cam_m[rows], own, is_bridged)
-        offsets[rows], own_stddev = _interpolated_centers(trajectory, own, is_bridged)
-        stddev[rows] = np.hypot(own_stddev, _timing_stddev(time_resolution_s, trajectory, own, options))
-    centers[rows] = own.between(trajectory.centers) + offsets[rows]
-    on_keyframes = (at.before, at.after, at.fraction)
-    return PlacesOnPath(*on_keyframes, centers, offsets, arms_m, stddev, arm_stddev_m)
 
 
 def _places_by_time(log: RangeLog, times: Array, keyframe_times: Array, options: RangesOptions) -> OnPath:
@@ -120,7 +84,7 @@ def _places_by_time(log: RangeLog, times: Array, keyframe_times: Array, options:
     nearest = keyframes_around(times, keyframe_times).nearest
     distance = np.abs(times - keyframe_times[nearest])
     # Standing still is tested only at keyframes with a long gap on both sides; elsewhere poses are interpolated.
-    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
+    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), max_gap_s), [True]])
     lonely = (log.kind == RangeKind.TAG_ANCHOR) & (long_gap[:-1] & long_gap[1:])[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
     return at.moved(still | (distance <= min(_SAME_TIME_S, max_difference_s)), nearest)
@@ -165,57 +129,3 @@ def _deviations(values: Array) -> Array:
     Among few values that 0 would lower the estimated noise considerably.
     """
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
-
-
-def _interpolated_centers(trajectory: Trajectory, at: OnPath, is_bridged: Mask) -> tuple[Array, Array]:
-    """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
-
-    Also returns the standard deviation (n,) of each coordinate.
-    """
-    motion = learn_motion(trajectory.times_s, trajectory.centers, is_bridged)
-    offsets, stddev = np.zeros((len(at.before), 3)), np.full(len(at.before), motion.noise_stddev)
-    between = at.fraction > 0
-    offsets[between], stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])
-    return offsets, stddev
-
-
-def _interpolated_lever_arms(
-    trajectory: Trajectory, tags_in_cam_m: Array, at: OnPath, is_bridged: Mask
-) -> tuple[Array, Array]:
-    """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
-
-    The rotation vectors from keyframe to keyframe, in the camera's frame, are summed up and treated as coordinates of a
-    motion. This is valid while successive rotations are small or have the same axis.
-    """
-    to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
-    turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
-    motion = learn_motion(trajectory.times_s, turned, is_bridged)
-    stddev = np.full(len(at.before), motion.noise_stddev)
-    between = at.fraction > 0
-    beyond, stddev[between] = motion.beyond_chord(at.before[between], at.fraction[between])
-    arms = tags_in_cam_m.copy()
-    turns = at.fraction[between, None] * to_next.as_rotvec()[at.before[between]] + beyond
-    if len(turns):  # SciPy before 1.16 cannot make an empty set of rotations
-        arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
-    # A rotation moves the end of the arm in two of the three directions.
-    stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
-    return np.einsum("nij,nj->ni", trajectory.world_from_cam[at.before], arms), stddev_m
-
-
-def _timing_stddev(log_resolution_s: float, trajectory: Trajectory, at: OnPath, options: RangesOptions) -> Array:
-    """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
-
-    Uniform rounding to a step has the standard deviation step / sqrt(12). It is independent for each time.
-    """
-    times, centers = trajectory.timestamps_s, trajectory.centers
-    log_stddev_s, photo_stddev_s = log_resolution_s / np.sqrt(12), trajectory.time_resolution_s / np.sqrt(12)
-    if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
-        return np.zeros(len(at.before))
-    gaps = np.diff(times)
-    # Across a long gap ranges are used only if the camera stood still.
-    speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
-    around = np.concatenate([[0.0], speeds, [0.0]])
-    is_at, following = at.before == at.after, around[at.before + 1]
-    speed = np.where(is_at, np.maximum(around[at.before], following), following)
-    photo_share = np.where(is_at, 1.0, np.hypot(1 - at.fraction, at.fraction))
-    return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))

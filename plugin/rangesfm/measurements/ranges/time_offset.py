@@ -12,7 +12,7 @@ from rangesfm.measurements.clock.fit import OffsetFit
 from rangesfm.measurements.clock.offset import OffsetCurve, TimeOffset
 from rangesfm.measurements.clock.path_samples import PathSamples, moving_path, standing_path
 from rangesfm.measurements.clock.search import likely_offsets, offset_of_motion, require_enough
-from rangesfm.measurements.ranges.association import associate, is_too_long
+from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.noise import MIN_NOISE_M
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
@@ -22,7 +22,7 @@ from rangesfm.progress import SILENT, Progress
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.robust_statistics import RobustLoss
-from rangesfm.util.geometry.trajectory import Trajectory, keyframes_around
+from rangesfm.util.geometry.trajectory import Trajectory, is_too_long, keyframes_around
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Times that are no further apart than this fraction of the median time between photos belong together: ranges to a
@@ -76,11 +76,12 @@ def estimate_time_offset(
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
     require_enough(trajectory, len(log), TimedRanges)
     tags, rows = log.lever_arms(tag_in_cam_m), log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR]
-    if is_too_long(float(np.median(np.diff(trajectory.timestamps_s))), association):
+    max_gap_s = association.max_interpolation_gap_s
+    if is_too_long(float(np.median(np.diff(trajectory.timestamps_s))), max_gap_s):
         found = _offset_of_bursts(log, rows, trajectory, tags, association)
         if found is not None:
             return found
-    path = moving_path(trajectory, tags, association, TimedRanges.remedy)
+    path = moving_path(trajectory, tags, max_gap_s, TimedRanges.remedy)
     ranges = TimedRanges(log.timestamp_s[rows], path, log.range_m[rows], log.anchor_index[rows], log.tag_index[rows])
     return offset_of_motion(ranges, seed=seed, progress=progress)
 

@@ -8,6 +8,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
@@ -144,6 +145,11 @@ def keyframes_around(times: Array, keyframe_times: Array) -> OnPath:
     return OnPath(before, after, fraction)
 
 
+def is_too_long(gaps_s: npt.ArrayLike, max_gap_s: float) -> Mask:
+    """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
+    return np.asarray(gaps_s) > max_gap_s + ROUNDING_S
+
+
 def places_in_time(times: Array, keyframe_times: Array, *, max_gap_s: float, max_difference_s: float) -> OnPath:
     """Return the places of times (n,): between two keyframes that are close in time, or else at one that is near.
 
@@ -153,7 +159,7 @@ def places_in_time(times: Array, keyframe_times: Array, *, max_gap_s: float, max
     around = keyframes_around(times, keyframe_times)
     gap = keyframe_times[around.after] - keyframe_times[around.before]
     is_inside = (times >= keyframe_times[0]) & (times <= keyframe_times[-1])
-    is_between = is_inside & (gap > 0) & (gap <= max_gap_s + ROUNDING_S)
+    is_between = is_inside & (gap > 0) & ~is_too_long(gap, max_gap_s)
     is_near = np.abs(times - keyframe_times[around.nearest]) <= max_difference_s
     return around.moved(~is_between, np.where(is_near, around.nearest, -1))
 
