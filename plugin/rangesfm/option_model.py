@@ -154,8 +154,8 @@ class Options(BaseModel):
     def keys(cls) -> Mapping[str, Key]:
         """Return all keys of this table by name, those that it shares with other tables last."""
         bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
-        keys = {}
-        for name, field in sorted(cls.model_fields.items(), key=lambda item: item[0] not in cls.__annotations__):
+        keys, order = {}, [*cls.__annotations__, *cls.model_fields]
+        for name, field in sorted(cls.model_fields.items(), key=lambda item: order.index(item[0])):
             meta = next((item for item in field.metadata if isinstance(item, Key)), Key())
             if not meta.is_key:
                 continue

@@ -49,6 +49,7 @@ _Zero = Annotated[float, Field(ge=0, le=0)]
 _Positive = Annotated[float, Field(ge=STDDEV_M.least, le=STDDEV_M.most)]
 Uncertainty = _Zero | _Positive
 _Time = Annotated[float, Field(ge=TIME_S.least, le=TIME_S.most)]
+_Offset = Literal["auto"] | _Time
 _Duration = Annotated[float, Field(ge=DURATION_S.least, le=DURATION_S.most)]
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
@@ -212,7 +213,22 @@ class RangeModelOptions(Options, table="ranges"):
     """Standard deviation of the prior of the bias that is common to all anchors (the tag's delay), mean 0."""
 
 
-class RangesOptions(RangeModelOptions):
+def _offset_key(table: str) -> Key:
+    return Key(flag=f"{table}_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them')
+
+
+class _OptionsOfLog(Options):
+    """What all logs have that are kept by a clock of their own."""
+
+    time_offset: _Offset = "auto"
+
+    @property
+    def time_offset_s(self) -> float | None:
+        """Return the given time offset, or None where it is to be searched for."""
+        return None if self.time_offset == "auto" else self.time_offset
+
+
+class RangesOptions(RangeModelOptions, _OptionsOfLog):
     """The radio's log, how its ranges are placed on the path, assumptions about its errors, and checks."""
 
     path: Annotated[
@@ -248,10 +264,7 @@ class RangesOptions(RangeModelOptions):
     """Time that the delays of both devices together add to a round trip, for ranges computed from time stamps."""
     error_curve: Annotated[Path | None, Key(role="file")] = None
     """File with the radio's error by distance, written by rangesfm ranges calibrate."""
-    time_offset: Annotated[
-        Literal["auto"] | _Time,
-        Key(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
-    ] = "auto"
+    time_offset: Annotated[_Offset, _offset_key("ranges")] = "auto"
     """Time offset between the clocks: image time = range time + offset. auto: it is searched for."""
 
     max_interpolation_gap_s: _Duration = 2.0
@@ -268,11 +281,6 @@ class RangesOptions(RangeModelOptions):
         _Times, AfterValidator(_span), Key(metavar="A,B", expected="two times in seconds, the later one last")
     ] = ()
     """First and last time, on the radio's clock; the ranges between them are checks."""
-
-    @property
-    def time_offset_s(self) -> float | None:
-        """Return the given time offset, or None where it is to be searched for."""
-        return None if self.time_offset == "auto" else self.time_offset
 
 
 class AnchorOptions(Options, table="anchors"):
@@ -315,7 +323,7 @@ class PointOptions(Options, table="points"):
     as it is estimated with the map."""
 
 
-class PositionOptions(Options, table="positions"):
+class PositionOptions(_OptionsOfLog, table="positions"):
     """Positions of an antenna on the camera: by satellites, by a radio that hands out positions, or a total station."""
 
     path: Annotated[Path | None, Key(flag="positions", role="file_or_photos", metres="positions")] = None
@@ -339,14 +347,7 @@ class PositionOptions(Options, table="positions"):
     """Id of the tag on the camera, for a file with positions of several."""
     antenna_in_cam_m: Annotated[_LeverArm, Key(flag="antenna_in_cam", metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
     """Lever arm: position of the antenna, or of the prism, in the camera frame (right, down, forward), metres."""
-    time_offset: Annotated[
-        Literal["auto"] | _Time,
-        Key(
-            flag="positions_time_offset",
-            metavar="auto|SECONDS",
-            expected='"auto" or seconds, at most 1e+10 of them',
-        ),
-    ] = "auto"
+    time_offset: Annotated[_Offset, _offset_key("positions")] = "auto"
     """Time offset between the clocks: image time = time of the position + offset. auto: it is searched for."""
     stddev_m: Annotated[_Positive | None, Key(flag="position_stddev_m")] = None
     """Standard deviation of each coordinate of the positions, in place of what the file says of it (default: as the
@@ -354,13 +355,8 @@ class PositionOptions(Options, table="positions"):
     lasting_s: Annotated[Annotated[float, Field(ge=1e-2, le=1e5)] | None, Key(flag="position_lasting_s")] = None
     """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s, learnt with the map)."""
 
-    @property
-    def time_offset_s(self) -> float | None:
-        """Return the given time offset, or None where it is to be searched for."""
-        return None if self.time_offset == "auto" else self.time_offset
 
-
-class ImuOptions(Options, table="imu"):
+class ImuOptions(_OptionsOfLog, table="imu"):
     """The log of an inertial sensor (IMU) that is fixed to the camera: of a phone, an action camera or a rig."""
 
     path: Annotated[
@@ -376,23 +372,11 @@ class ImuOptions(Options, table="imu"):
     the photos (default: found from these)."""
     imu_in_cam_m: Annotated[_LeverArm | None, Key(flag="imu_in_cam", metavar="X,Y,Z")] = None
     """Lever arm: position of the sensor in the camera frame (right, down, forward), metres (default: at the camera)."""
-    time_offset: Annotated[
-        Literal["auto"] | _Time,
-        Key(
-            flag="imu_time_offset",
-            metavar="auto|SECONDS",
-            expected='"auto" or seconds, at most 1e+10 of them',
-        ),
-    ] = "auto"
+    time_offset: Annotated[_Offset, _offset_key("imu")] = "auto"
     """Time offset between the clocks: image time = time of the log + offset. auto: found from the turns of the photos,
     with which a given one is compared."""
     noise: Annotated[Path | None, Key(flag="imu_noise", metavar="YAML", role="file")] = None
     """Kalibr's imu.yaml, with the densities of the sensor's noise (default: learnt)."""
-
-    @property
-    def time_offset_s(self) -> float | None:
-        """Return the given time offset, or None where it is to be searched for."""
-        return None if self.time_offset == "auto" else self.time_offset
 
 
 class TagOptions(Options, table="tag"):
