@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.cli.survey_flags import add_flags, add_restart_argument, add_survey_arguments, survey_from_arguments
+from rangesfm.cli.survey_flags import (
+    MEASURED,
+    add_flags,
+    add_restart_argument,
+    add_survey_arguments,
+    survey_from_arguments,
+)
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
@@ -18,8 +24,7 @@ if TYPE_CHECKING:
 
 _SCALE_KEYS = (
     *("images.path", "images.model", "images.times", "images.rig_config", "images.baseline_stddev_m"),
-    *("ranges", "anchors", "tag", "points", "positions", "imu", "mapper.num_threads", "scale", "markers", "export"),
-    *("report", "output"),
+    *(MEASURED, "anchors", "tag", "mapper.num_threads", "export", "report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"
 _MIN_NUM_PHOTOS = 20  # fewer walk too short a way to tell the time offset

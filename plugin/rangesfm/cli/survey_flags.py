@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from rangesfm.option_model import Key
     from rangesfm.survey.settings import Survey
 
+MEASURED = "measured"
+"""In place of the name of a table: all tables of what gives a map its metres."""
 _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
@@ -43,7 +45,8 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
     """Add flags for keys of a survey file; ``overrides_from_arguments`` returns their values.
 
     Args:
-        keys: dotted keys of a survey file, or names of tables for all of their keys; none: all keys there are.
+        keys: dotted keys of a survey file, or names of tables for all of their keys, or ``MEASURED``; none: all keys
+            there are.
         without: keys that get no flag here.
         by_own_names: whether the flags have the names of the keys, for a command that is about one table.
     """
@@ -52,8 +55,10 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
 
 
 def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...], by_own_names: bool) -> None:
-    from rangesfm.survey.settings import SURVEY_TABLES, chosen_keys
+    from rangesfm.survey.settings import METRIC_KEYS, SURVEY_TABLES, chosen_keys
 
+    if MEASURED in keys:
+        keys = (*keys, *(dotted.partition(".")[0] for dotted in METRIC_KEYS))
     for table, model in SURVEY_TABLES.items():
         # Both keys for lever arms share one flag.
         left_out = (*without, "tag.lever_arms_m")
