@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import pycolmap
+
+from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map, sfm_from_files
@@ -110,10 +113,18 @@ def _in_other_frames(map_: MetricMap, options: ExportOptions) -> Iterator[Metric
 
 
 def _read_map(result: ResultFolder) -> MetricMap:
-    reconstruction, summary = result.read_metric_model(), result.summary
+    reconstruction = result.read_metric_model()
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.output_path)
     result.path_in(reconstruction)  # raises an error where no photo has a time: the trajectory would be empty
+    return map_of_result(result, reconstruction, result.read(CenterCovariances).by_photo_m2)
+
+
+def map_of_result(
+    result: ResultFolder, reconstruction: pycolmap.Reconstruction, center_covariance_m2: Mapping[str, Array]
+) -> MetricMap:
+    """Return the map of a result, given its final model and the covariances of its keyframes (as of ``MetricMap``)."""
+    summary = result.summary
     return MetricMap(
         reconstruction,
         timestamps_s=result.timestamps_s,
@@ -125,5 +136,5 @@ def _read_map(result: ResultFolder) -> MetricMap:
         is_site=summary.frame == "site",
         upward=None if summary.up is None else summary.up[0],
         georeference=None if summary.georeference is None else summary.georeference.georeference,
-        center_covariance_m2=result.read(CenterCovariances).by_photo_m2,
+        center_covariance_m2=center_covariance_m2,
     )

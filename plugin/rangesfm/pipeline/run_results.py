@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
-import numpy as np
-
 from rangesfm.comparison.with_reference import papers_table, reference_in_frame
 from rangesfm.errors import BAD_INPUT, InputError
-from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
+from rangesfm.export import COVARIANCE_FORMATS, export_map, write_model
+from rangesfm.pipeline.export_result import map_of_result
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.result_records import summary_of, tables_of
 from rangesfm.report import write_report_of
@@ -18,13 +18,11 @@ from rangesfm.result.comparison_row import ComparisonRow
 from rangesfm.result.joint_covariance import write_map_errors
 from rangesfm.result.places import recorded_path, recorded_settings
 from rangesfm.result.result_folder import REFERENCE_NAME, ResultFolder, new_result, read_result_folder
-from rangesfm.sfm.steps import DATABASE_NAME
 from rangesfm.solver.installation_checks import recorded_versions
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_hashes
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.util.files.atomic import path_of
-from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.reference import write_reference
 
 
@@ -42,18 +40,21 @@ def write_results(run: SurveyRun, metric: MetricResult) -> ResultFolder:
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
             comparison = _comparison(metric, staged)
-            not_exported = _write_models_and_tables(survey, metric, staged)
-        summary = summary_of(
-            metric,
-            **({"comparison": comparison} if comparison else {}),
-            versions=recorded_versions(),
-            settings=recorded_settings(survey),
-            inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],
-            seconds=journal.all_seconds(),
-            computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            warnings=journal.warnings,
-            notes=journal.notes,
-        )
+            _write_models_and_tables(metric, staged)
+            summary = summary_of(
+                metric,
+                **({"comparison": comparison} if comparison else {}),
+                versions=recorded_versions(),
+                settings=recorded_settings(survey),
+                inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],
+                seconds={},
+                computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+                warnings=journal.warnings,
+                notes=journal.notes,
+            )
+            result = ResultFolder(folder, summary, metric.trajectory.times_by_name)
+            not_exported = _export(survey, metric, result, staged)
+        summary = summary.model_copy(update={"seconds": journal.all_seconds()})
         summary.write(staged / summary.NAME)
         if survey.report.enabled:
             with journal.stage("report"):
@@ -61,7 +62,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> ResultFolder:
                 write_report_of(content, staged)
     if not_exported is not None:
         raise not_exported
-    return ResultFolder(folder, summary, metric.trajectory.times_by_name)
+    return replace(result, summary=summary)
 
 
 def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
@@ -82,18 +83,7 @@ def _comparison(metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]
     return rows
 
 
-def _write_models_and_tables(survey: Survey, found: MetricResult, folder: Path) -> InputError | None:
-    """Write the models, the tables and the export formats of a result into a new folder.
-
-    Formats that this result cannot have (points or covariances without any) are left out.
-
-    Returns:
-        The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
-        complete in either case.
-
-    Raises:
-        RangesfmError: something else failed, such as a full disk.
-    """
+def _write_models_and_tables(found: MetricResult, folder: Path) -> None:
     write_model(found.scaled, folder / "sparse_scaled" / "0")
     if found.refined is not None:
         write_model(found.final, folder / "sparse_metric" / "0")
@@ -101,24 +91,25 @@ def _write_models_and_tables(survey: Survey, found: MetricResult, folder: Path) 
         table.write(folder)
     if found.map_errors.are_known:
         write_map_errors(found.map_errors, folder)
-    map_ = MetricMap(
-        found.final,
-        timestamps_s=found.trajectory.times_by_name,
-        anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
-        metric_from_sfm=found.estimate.metric_from_sfm,
-        relative_scale_stddev=found.estimate.uncertainty.empirical,
-        images_path=survey.images.path,
-        database_path=survey.output.path / DATABASE_NAME,
-        is_site=found.estimate.frame == "site",
-        upward=found.upward(gravity_of(survey.scale.up_in_first_camera)),
-        georeference=found.georeference,
-        center_covariance_m2=found.center_covariance_m2,
-    )
+
+
+def _export(survey: Survey, found: MetricResult, result: ResultFolder, folder: Path) -> InputError | None:
+    """Write the export formats of a result into a new folder.
+
+    Formats that this result cannot have (points or covariances without any) are left out.
+
+    Returns:
+        The error of a format that cannot be written, for a warning; None if all were written.
+
+    Raises:
+        RangesfmError: something else failed, such as a full disk.
+    """
+    map_ = map_of_result(result, found.final, found.center_covariance_m2)
     impossible = [] if found.final.num_points3D() else ["ply"]
     impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
     formats = tuple(name for name in survey.export.formats if name not in impossible)
     try:
-        export_map(map_, folder, survey.export.changed(formats=formats))
+        export_map(replace(map_, images_path=survey.images.path), folder, survey.export.changed(formats=formats))
     except InputError as error:
         if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
             raise
