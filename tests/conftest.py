@@ -25,7 +25,7 @@ import numpy.typing as npt
 import pytest
 from tests.simulated.files import write_anchors, write_model
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.cli import main
@@ -33,6 +33,7 @@ from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
 from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.moments import ByPhoto
 from rangesfm.util.geometry.reference import Reference, write_reference
 from rangesfm.util.geometry.similarity import Similarity
@@ -138,6 +139,14 @@ class WalkedSurvey:
         files = ("--input_path", "sparse/0", "--ranges", "uwb.csv", "--images", "images.csv")
         return (*files, "--tag_in_cam", tag, "--ranges_time_offset", str(TIME_OFFSET_S))
 
+    def survey(self, output_path: Path) -> Survey:
+        """Return the same as a survey, with the anchors in the site's frame."""
+        files = {"images.model": "sparse/0", "images.times": "images.csv", "ranges.path": "uwb.csv"}
+        files["anchors.path"] = "anchors.csv"
+        numbers = {"ranges.time_offset": TIME_OFFSET_S, "tag.tag_in_cam_m": TAG_IN_CAM_M}
+        paths = {key: self.folder / name for key, name in files.items()}
+        return Survey().changed({**paths, **numbers, "output.path": output_path})
+
 
 @pytest.fixture(scope="session")
 def rangesfm_process() -> Command:
@@ -183,9 +192,7 @@ def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
     path = loop_path(42.0, start_s=99.0, seed=3)
     times: Array = np.arange(100, 140, dtype=np.float64)
     made = synthetic_model(
-        times,
-        path.centers(times),
-        path.world_from_cam(times),
+        *along(path, times),
         num_observations=60,
         max_track_length=8,
         pixel_stddev=0.5,

@@ -90,10 +90,6 @@ def remove_points(model: pycolmap.Reconstruction) -> None:
         model.delete_point3D(point_id)
 
 
-def nothing(folder: Path) -> None:
-    pass
-
-
 class Refusal:
     """Runs commands that must fail in one folder, and checks what they print and leave."""
 

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 import rangesfm
 from rangesfm.mapper_options import MapperOptions
@@ -199,7 +199,7 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
 def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
     times = np.arange(4, dtype=np.float64)
     path = loop_path(4.0)
-    model = synthetic_model(times, path.centers(times), path.world_from_cam(times), metric_from_sfm=IDENTITY)
+    model = synthetic_model(*along(path, times), metric_from_sfm=IDENTITY)
     bundle = bundle_adjustment(
         model.reconstruction,
         CameraOptions(),

@@ -23,6 +23,7 @@ from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurve
 from tests.pipeline.test_join_models import walk
 from tests.pipeline.test_surveys_of_rigs import TAG_IN_CAM_M as RIG_TAG_IN_CAM_M
 from tests.pipeline.test_surveys_of_rigs import stereo_survey
+from tests.simulated.files import write_marks
 from tests.simulated.looped import bent_laps, write_survey
 from tests.simulated.surveys import TAG_IN_CAM_M as LAPS_TAG_IN_CAM_M
 
@@ -191,27 +192,23 @@ def survey(own_survey: WalkedSurvey) -> WalkedSurvey:
     write_anchors(folder / "typed.csv", A3=(x, y + 0.6, z))
     write_anchors(folder / "flat.csv", **{name: (x, y, SITE_M[2] + 0.5) for name, (x, y, _) in ANCHORS_M.items()})
     (folder / "taped.csv").write_text("from,to,distance_m,stddev_m\nA1,A2,12.17,0.02\n")
-    write_marks(own_survey)
+    mark_points(own_survey)
     write_positions(own_survey)
     return own_survey
 
 
-def write_marks(survey: WalkedSurvey) -> None:
+def mark_points(survey: WalkedSurvey) -> None:
     """Write marks of points of the map in their photos, their surveyed coordinates, and a length between two."""
     model, rng = pycolmap.Reconstruction(survey.folder / "sparse" / "0"), np.random.default_rng(7)
     seen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 6][::40][:6]
-    marks, points, places = "marker,image_name,x_px,y_px\n", "marker,x_m,y_m,z_m,stddev_m\n", {}
+    points, places = "marker,x_m,y_m,z_m,stddev_m\n", {}
     for number, point_id in enumerate(seen):
         place = survey.site_from_sfm.apply(model.point3D(point_id).xyz[None])[0]
         places[f"M{number}"] = place
         x, y, z = (place + 0.01 * rng.standard_normal(3)).tolist()
         points += f"M{number},{x:.4f},{y:.4f},{z:.4f},0.01\n"
-        for element in model.point3D(point_id).track.elements:
-            image = model.image(element.image_id)
-            x_px, y_px = np.ravel(image.points2D[element.point2D_idx].xy).tolist()
-            marks += f"M{number},{image.name},{x_px:.2f},{y_px:.2f}\n"
+    write_marks(survey.folder / "markers.csv", model, {f"M{k}": point_id for k, point_id in enumerate(seen)})
     length_m = float(np.linalg.norm(places["M0"] - places["M1"]))
-    (survey.folder / "markers.csv").write_text(marks)
     (survey.folder / "points.csv").write_text(points)
     lengths = f"from,to,distance_m,stddev_m\nM0,M1,{length_m + 0.004:.4f},0.005\n"
     (survey.folder / "between_marks.csv").write_text(lengths)

@@ -73,14 +73,14 @@ class Group:
     title: str | None = None
 
 
-def scale_figures(*, named: str = "mistake named") -> tuple[Figure, ...]:
+def scale_figures() -> tuple[Figure, ...]:
     """Figures that all groups have which state an interval of the scale."""
     return (
         Figure("scale covered", "covered", "mean", "%", "lower"),
         Figure("error", "error", "rms", "%", "higher"),
         Figure("in stated stddevs", "in_stddevs", "rms", "", "higher"),
         Figure("half width", "half_width", "median", "%", "higher"),
-        Figure(named, "named", "mean", "%", "higher"),
+        Figure("mistake named", "named", "mean", "%", "higher"),
         Figure("refused", "refused", "mean", "%", "higher"),
     )
 
@@ -102,23 +102,22 @@ REFUSED: Values = {"refused": 1.0}
 
 
 def one_log(data: Path, name: str, with_single_anchors: bool) -> Cases:
-    described = json.loads((Path(real_logs.__file__).with_suffix(".json")).read_text(encoding="utf-8"))[name]
-    log, anchors, reference = real_logs.read_set(data, described)
-    path, found = real_logs.path_of(reference), Cases()
-    for case in real_logs.cases(log, anchors, path):
+    real, found = real_logs.RealLog.read(data, name), Cases()
+    for case in real.cases():
         if with_single_anchors or not case.name.startswith("only"):
-            observations = real_logs.placed(log, case, path, described, by_photo=False)
-            row = real_logs.one_survey(name, case, observations, path)
-            of_path = {} if row is None or row[4] is None else {"rmse": row[4]}
-            found[f"{name}, {case.name}"] = REFUSED if row is None else {**of_interval(*row[:4]), **of_path}
+            row = real_logs.one_survey(name, case, real.placed(case, real.path), real.path)
+            if row is None:
+                found[f"{name}, {case.name}"] = REFUSED
+                continue
+            of_path = {} if row.away_m is None else {"rmse": row.away_m}
+            found[f"{name}, {case.name}"] = {**of_interval(row.error, row.low, row.high, row.num_named), **of_path}
     return found
 
 
 def log_tasks(data: Path | None, quick: bool) -> list[Task]:
-    sets = json.loads((Path(real_logs.__file__).with_suffix(".json")).read_text(encoding="utf-8"))
     return [
         Task("real logs", name, partial(one_log, data, name, not quick), 40.0)
-        for name, described in sets.items()
+        for name, described in real_logs.SETS.items()
         if data is not None and (data / described["ranges"]).is_file()
     ]
 

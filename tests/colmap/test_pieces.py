@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import sequence_path
+from tests.simulated.path import along, sequence_path
 from tests.simulated.pieces import leave_across, points_across
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_parts, loose_pieces, overlaps_in, seen_in
@@ -20,9 +20,7 @@ def model() -> pycolmap.Reconstruction:
     """A chain of photos, each of which shares points with the next three only."""
     times = np.arange(float(NUM_PHOTOS))
     path = sequence_path(float(NUM_PHOTOS), seed=1)
-    walk = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=80, max_track_length=4
-    )
+    walk = synthetic_model(*along(path, times), num_observations=80, max_track_length=4)
     return walk.reconstruction
 
 

@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 from tests.conftest import Command, WalkedSurvey
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.colmap.reprojection import wrong_axes
 
@@ -25,7 +25,7 @@ AS_IS = np.eye(3)
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     path, times = loop_path(20.0), np.arange(20.0)
-    made = synthetic_model(times, path.centers(times), path.world_from_cam(times), num_observations=60, seed=1)
+    made = synthetic_model(*along(path, times), num_observations=60, seed=1)
     return made.reconstruction
 
 

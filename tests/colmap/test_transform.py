@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import orbit_path
+from tests.simulated.path import along, orbit_path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
@@ -14,7 +14,7 @@ from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 @pytest.fixture(scope="module")
 def model() -> SyntheticModel:
     path, times = orbit_path(10.0), np.linspace(0.0, 10.0, 8)
-    return synthetic_model(times, path.centers(times), path.world_from_cam(times), num_observations=30)
+    return synthetic_model(*along(path, times), num_observations=30)
 
 
 def test_poses_and_points_arrive_at_their_true_places(model: SyntheticModel) -> None:

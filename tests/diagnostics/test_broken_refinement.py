@@ -67,20 +67,8 @@ def walked_survey(dense_survey: WalkedSurvey) -> WalkedSurvey:
 
 @pytest.fixture
 def survey(own_survey: WalkedSurvey) -> Survey:
-    folder = own_survey.folder
-    return Survey().changed(
-        {
-            "images.model": folder / "sparse" / "0",
-            "images.times": folder / "images.csv",
-            "ranges.path": folder / "uwb.csv",
-            "ranges.time_offset": 2.0,
-            "anchors.path": folder / "anchors.csv",
-            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "refine.max_num_iterations": 40,
-            "report.enabled": False,
-            "output.path": folder / "out",
-        }
-    )
+    changes = {"refine.max_num_iterations": 40, "report.enabled": False}
+    return own_survey.survey(own_survey.folder / "out").changed(changes)
 
 
 def spoilt(survey: Survey, spoil: Spoil) -> Survey:

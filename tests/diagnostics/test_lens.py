@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.diagnostics.lens import doubts_of_lens
 
@@ -22,9 +22,7 @@ def walk(seed: int) -> pycolmap.Reconstruction:
     times = np.arange(100, 140, dtype=np.float64)
     path = loop_path(42.0, start_s=99.0, seed=seed)
     return synthetic_model(
-        times,
-        path.centers(times),
-        path.world_from_cam(times),
+        *along(path, times),
         num_observations=100,
         max_track_length=8,
         pixel_stddev=0.5,

@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 from tests.known import known
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics import preflight
@@ -205,9 +205,7 @@ def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pa
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     path, times = loop_path(30.0, seed=3), np.arange(1.0, 29.0)
-    made = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=40, pixel_stddev=1.0
-    )
+    made = synthetic_model(*along(path, times), num_observations=40, pixel_stddev=1.0)
     return made.reconstruction
 
 

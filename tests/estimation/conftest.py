@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import lap_path
+from tests.simulated.path import along, lap_path
 
 from rangesfm.estimation.vision_information import Rays, model_rays
 from rangesfm.util.geometry.poses import Poses, model_poses
@@ -24,9 +24,7 @@ def chain() -> SyntheticModel:
     path = lap_path(30.0, share=0.1)
     times = np.linspace(0.0, 30.0, NUM_KEYFRAMES)
     return synthetic_model(
-        times,
-        path.centers(times),
-        path.world_from_cam(times),
+        *along(path, times),
         num_observations=40,
         max_track_length=6,
         depth_range_m=(4.0, 30.0),

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import orbit_path
+from tests.simulated.path import along, orbit_path
 
 from rangesfm.errors import SolverError
 from rangesfm.options import CameraOptions, RefineOptions
@@ -23,9 +23,8 @@ def orbit() -> pycolmap.Reconstruction:
 
 @cache
 def _orbit() -> pycolmap.Reconstruction:
-    times, path = np.arange(6.0), orbit_path(8.0)
-    poses = (times, path.centers(times), path.world_from_cam(times))
-    return synthetic_model(*poses, num_observations=20, pixel_stddev=1.0).reconstruction
+    photos = along(orbit_path(8.0), np.arange(6.0))
+    return synthetic_model(*photos, num_observations=20, pixel_stddev=1.0).reconstruction
 
 
 def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:

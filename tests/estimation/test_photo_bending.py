@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import SyntheticModel, random_similarity, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 from tests.simulated.pieces import leave_across
 
 from rangesfm.colmap.transform import rescale
@@ -24,18 +24,16 @@ def simulated(pixel_stddev: float) -> SyntheticModel:
     path = loop_path(float(NUM))
     times = np.arange(NUM, dtype=np.float64)
     return synthetic_model(
-        times,
-        path.centers(times),
-        path.world_from_cam(times),
+        *along(path, times),
         num_observations=100,
         max_track_length=4,
         pixel_stddev=pixel_stddev,
     )
 
 
-def bending_of(model: pycolmap.Reconstruction, options: RefineOptions | None = None) -> MapBending:
+def bending_of(model: pycolmap.Reconstruction) -> MapBending:
     trajectory = trajectory_from_reconstruction(model)
-    return bending_of_model(model, trajectory, CameraOptions(refine_intrinsics=False), options or RefineOptions(), 1)
+    return bending_of_model(model, trajectory, CameraOptions(refine_intrinsics=False), RefineOptions(), 1)
 
 
 def along_x(path: Trajectory) -> np.typing.NDArray[np.float64]:
@@ -86,9 +84,9 @@ def test_twice_the_noise_bends_twice_as_far() -> None:
     assert np.median(stddevs[1] / stddevs[0]) == pytest.approx(2.0, rel=0.2)
 
 
-def of_two_parts(pixel_stddev: float = 1.0) -> pycolmap.Reconstruction:
+def of_two_parts() -> pycolmap.Reconstruction:
     """Return a map whose last photos see nothing of what the first ones see."""
-    model = simulated(pixel_stddev).reconstruction
+    model = simulated(1.0).reconstruction
     leave_across(model, {image.name for image in model.images.values() if image.image_id > NUM_OF_FIRST}, 0)
     return model
 

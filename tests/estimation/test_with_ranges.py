@@ -16,7 +16,7 @@ from tests.known_errors import known_errors, predicted_by_model
 from tests.simulated.looped import ScaledMap, two_laps
 from tests.simulated.model import synthetic_model
 from tests.simulated.outliers import spoilt
-from tests.simulated.path import loop_path, sequence_path
+from tests.simulated.path import along, loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
 from tests.simulated.surveys import range_log
 
@@ -125,9 +125,7 @@ def make_survey(
     path = path or loop_path(20.0, unsteadiness_m=0.1, seed=3)
     times = np.linspace(path.start_s, path.end_s, num_keyframes)
     model_options = {"num_observations": 60, **model_options}
-    model = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), pixel_stddev=pixel_stddev, seed=seed, **model_options
-    )
+    model = synthetic_model(*along(path, times), pixel_stddev=pixel_stddev, seed=seed, **model_options)
     if pixel_stddev > 0:
         adjust_by_colmap(model.reconstruction)
     radio = radio or Radio()

@@ -20,7 +20,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.export.models import read_ply, xyz
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
@@ -44,7 +44,7 @@ def map_() -> MetricMap:
     """A walk in a metric world with z up, with the camera upright."""
     path = loop_path(20.0, start_s=0.0, seed=1)
     times = np.arange(20, dtype=np.float64)
-    made = synthetic_model(times, path.centers(times), path.world_from_cam(times), pixel_stddev=0.0, seed=2)
+    made = synthetic_model(*along(path, times), pixel_stddev=0.0, seed=2)
     model = rescale(made.reconstruction, made.metric_from_sfm)
     return MetricMap(model, made.timestamps_s, ANCHORS, made.metric_from_sfm, relative_scale_stddev=0.01)
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 def map_() -> MetricMap:
     path = loop_path(20.0, start_s=0.0, seed=1)
     times = np.arange(6, dtype=np.float64)
-    made = synthetic_model(times, path.centers(times), path.world_from_cam(times), pixel_stddev=0.0, seed=2)
+    made = synthetic_model(*along(path, times), pixel_stddev=0.0, seed=2)
     factors = np.random.default_rng(0).normal(0, 0.1, (6, 3, 3))
     covariances = dict(zip(made.timestamps_s, factors @ np.swapaxes(factors, 1, 2), strict=True))
     model = rescale(made.reconstruction, made.metric_from_sfm)

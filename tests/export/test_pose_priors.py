@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_pose_priors
@@ -19,7 +19,7 @@ from rangesfm.measurements.positions.pose_priors import read_pose_priors
 @pytest.fixture
 def model() -> pycolmap.Reconstruction:
     path, times = loop_path(8.0), np.arange(4.0)
-    return synthetic_model(times, path.centers(times), path.world_from_cam(times), num_observations=20).reconstruction
+    return synthetic_model(*along(path, times), num_observations=20).reconstruction
 
 
 def test_pose_priors_are_the_maps_positions_and_replace_others(tmp_path: Path, model: pycolmap.Reconstruction) -> None:

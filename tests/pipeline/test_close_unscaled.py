@@ -105,7 +105,7 @@ def test_photos_that_look_alike_close_loops_that_a_map_does_not_predict(
 
 
 def test_aisles_that_look_alike_are_not_taken_for_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey, listener = two_aisles(num_keyframes=10, length_m=4.0), Listener()
+    survey, listener = two_aisles(), Listener()
     made = Reconstructed.of(survey.looped, tmp_path / "out")
     open_m, match = made.error_m(made.model), LoopMatching.match
 
@@ -118,7 +118,7 @@ def test_aisles_that_look_alike_are_not_taken_for_one(tmp_path: Path, monkeypatc
 
 
 def test_loops_stay_open_where_more_than_neighbours_was_matched(tmp_path: Path) -> None:
-    made = Reconstructed.of(two_aisles(num_keyframes=10, length_m=4.0).looped, tmp_path / "out")
+    made = Reconstructed.of(two_aisles().looped, tmp_path / "out")
     survey = Survey().changed({"mapper.matching": "exhaustive", "output.path": made.out})
     models: Sequence[pycolmap.Reconstruction] = [made.model]
     assert close_loops_of_models(survey, models, Journal(SILENT)) is models[0]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 from tests.known import known
 from tests.simulated.model import random_similarity, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.cli import main
@@ -125,9 +125,7 @@ def walk(anchors_m: Mapping[str, tuple[float, float, float]] = ANCHORS_M) -> Hal
     """Simulate its photos, and ranges to four anchors at each."""
     path = walked()
     times = np.arange(100.0, 100.0 + NUM_PHOTOS)
-    made = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=30, max_track_length=8, seed=1
-    )
+    made = synthetic_model(*along(path, times), num_observations=30, max_track_length=8, seed=1)
     at = np.repeat(times, 2)
     log = simulate_ranges_at(at, path.centers(at), path.world_from_cam(at), anchors_m, TAG_IN_CAM_M, Radio(), 5)
     names, rng, parts = list(made.timestamps_s), np.random.default_rng(0), []

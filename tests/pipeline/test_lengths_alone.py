@@ -188,22 +188,10 @@ def test_check_tells_what_a_survey_without_a_radio_has(room: Room, tmp_path: Pat
 
 @pytest.mark.parametrize("factor", [1.0, 1.3])
 def test_ranges_and_lengths_check_each_other(walked_survey: WalkedSurvey, tmp_path: Path, factor: float) -> None:
-    folder = walked_survey.folder
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    model = pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
     images = sorted(model.images.values(), key=lambda image: image.name)
     first, middle = images[0], images[len(images) // 2]
-    base = Survey().changed(
-        {
-            "images.model": folder / "sparse" / "0",
-            "images.times": folder / "images.csv",
-            "ranges.path": folder / "uwb.csv",
-            "ranges.time_offset": 2.0,
-            "anchors.path": folder / "anchors.csv",
-            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "output.path": tmp_path / "out",
-            "report.enabled": False,
-        }
-    )
+    base = walked_survey.survey(tmp_path / "out").changed({"report.enabled": False})
     length = float(np.linalg.norm(first.projection_center() - middle.projection_center()))
     distances = tmp_path / "d.csv"
     length_m = factor * length * walked_survey.site_from_sfm.scale

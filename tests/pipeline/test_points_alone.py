@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.conftest import TAG_IN_CAM_M, WalkedSurvey
+from tests.conftest import WalkedSurvey
 from tests.known import assert_scale, known
+from tests.simulated.files import write_marks
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.pipeline.run import refine_model, scale_model
@@ -56,30 +57,19 @@ class Yard:
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
     """Simulate fourteen photos on a loop, with marks clicked to half a pixel."""
-    path, times, rng = (
-        loop_path(20.0, height_amplitude_m=0.5, seed=1),
-        np.arange(0.0, 20.0, 1.5),
-        np.random.default_rng(5),
-    )
-    made = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=120, pixel_stddev=0.5, seed=2
-    )
+    path, rng = loop_path(20.0, height_amplitude_m=0.5, seed=1), np.random.default_rng(5)
+    photos = along(path, np.arange(0.0, 20.0, 1.5))
+    made = synthetic_model(*photos, num_observations=120, pixel_stddev=0.5, seed=2)
     folder = tmp_path_factory.mktemp("yard")
     model = made.reconstruction
     (folder / "sparse").mkdir()
     model.write(folder / "sparse")
     seen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 4]
-    marks_m, lines = {}, "marker,image_name,x_px,y_px\n"
     true_m = _true_points(made, seen)
     near = [i for i in seen if np.linalg.norm(true_m[i] - made.centers_m.mean(axis=0)) < 10]
-    for k, point_id in enumerate(rng.choice(near, NUM_POINTS, replace=False).tolist()):
-        marks_m[f"M{k}"] = true_m[point_id]
-        for element in model.point3D(point_id).track.elements:
-            image = model.image(element.image_id)
-            at = np.ravel(image.points2D[element.point2D_idx].xy)
-            lines += f"M{k},{image.name},{at[0]:.2f},{at[1]:.2f}\n"
-    (folder / "markers.csv").write_text(lines)
-    return Yard(folder, made, marks_m)
+    marked = {f"M{k}": i for k, i in enumerate(rng.choice(near, NUM_POINTS, replace=False).tolist())}
+    write_marks(folder / "markers.csv", model, marked)
+    return Yard(folder, made, {name: true_m[point_id] for name, point_id in marked.items()})
 
 
 def _true_points(made: SyntheticModel, ids: Sequence[int]) -> dict[int, Array]:
@@ -167,31 +157,16 @@ def test_a_check_point_that_is_not_where_the_map_has_it_makes_the_verdicts_doubt
 def test_beside_ranges_a_check_point_is_compared_with_the_map_that_they_hold(
     walked_survey: WalkedSurvey, tmp_path: Path
 ) -> None:
-    folder, model = walked_survey.folder, pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
+    model = pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
     chosen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 5][:100:20]
-    marks, points = "marker,image_name,x_px,y_px\n", "marker,x_m,y_m,z_m,stddev_m,kind\n"
+    points = "marker,x_m,y_m,z_m,stddev_m,kind\n"
     for k, point_id in enumerate(chosen):
         x_m, y_m, z_m = walked_survey.site_from_sfm.apply(model.point3D(point_id).xyz)
         points += f"M{k},{x_m},{y_m},{z_m + (k == 2)},0.01,check\n"
-        for element in model.point3D(point_id).track.elements:
-            image = model.image(element.image_id)
-            x_px, y_px = image.points2D[element.point2D_idx].xy
-            marks += f"M{k},{image.name},{x_px},{y_px}\n"
-    (tmp_path / "marks.csv").write_text(marks)
+    write_marks(tmp_path / "marks.csv", model, {f"M{k}": point_id for k, point_id in enumerate(chosen)})
     (tmp_path / "points.csv").write_text(points)
-    survey = Survey().changed(
-        {
-            "images.model": folder / "sparse" / "0",
-            "images.times": folder / "images.csv",
-            "ranges.path": folder / "uwb.csv",
-            "anchors.path": folder / "anchors.csv",
-            "tag.tag_in_cam_m": tuple(TAG_IN_CAM_M),
-            "points.path": tmp_path / "points.csv",
-            "scale.markers": tmp_path / "marks.csv",
-            "output.path": tmp_path / "out",
-            "report.enabled": False,
-        }
-    )
+    files = {"points.path": tmp_path / "points.csv", "scale.markers": tmp_path / "marks.csv"}
+    survey = walked_survey.survey(tmp_path / "out").changed({**files, "report.enabled": False})
     summary = scale_model(survey, progress=QUIET).summary
     assert [(test.name, test.subject) for test in summary.tests if test.rejected] == [("check point", "M2")]
     assert known(summary.place).verdict == "doubtful"

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.known import assert_scale, known
 from tests.simulated.files import write_model, write_rows
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 from tests.simulated.surveys import mapped, yard_truth
 
 from rangesfm.demo.simulated_radio import CameraPath
@@ -102,9 +102,7 @@ class Walk:
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     path, times = loop_path(30.0, height_amplitude_m=0.5, unsteadiness_m=0.1, seed=1), np.arange(0.0, 29.0, 1.0)
-    made = synthetic_model(
-        times, path.centers(times), path.world_from_cam(times), num_observations=60, pixel_stddev=0.5, seed=2
-    )
+    made = synthetic_model(*along(path, times), num_observations=60, pixel_stddev=0.5, seed=2)
     folder = tmp_path_factory.mktemp("walk")
     (folder / "sparse").mkdir()
     made.reconstruction.write(folder / "sparse")

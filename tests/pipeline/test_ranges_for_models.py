@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 import pytest
-from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 
 from rangesfm.pipeline.ranges_for_models import ranges_of_survey
 from rangesfm.pipeline.run import run_survey, scale_model
@@ -22,24 +21,12 @@ if TYPE_CHECKING:
 @pytest.fixture
 def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
     """The walked survey with a fifth of its ranges held out, and a taped length that is a bit too long."""
-    folder = walked_survey.folder
     first, last = walked_survey.image_names[0], walked_survey.image_names[20]
     length_m = 1.01 * np.linalg.norm(walked_survey.centers_m[20] - walked_survey.centers_m[0])
     (tmp_path / "taped.csv").write_text(f"from,to,distance_m,stddev_m\n{first},{last},{length_m:.4f},0.01\n")
-    values = {
-        "images.model": folder / "sparse" / "0",
-        "images.times": folder / "images.csv",
-        "ranges.path": folder / "uwb.csv",
-        "ranges.time_offset": TIME_OFFSET_S,
-        "ranges.check_share": 0.2,
-        "anchors.path": folder / "anchors.csv",
-        "tag.tag_in_cam_m": TAG_IN_CAM_M,
-        "scale.distances": tmp_path / "taped.csv",
-        "refine.enabled": False,
-        "report.enabled": False,
-        "output.path": tmp_path / "out",
-    }
-    return Survey().changed(values)
+    only_scaled = {"refine.enabled": False, "report.enabled": False}
+    measured = {"ranges.check_share": 0.2, "scale.distances": tmp_path / "taped.csv"}
+    return walked_survey.survey(tmp_path / "out").changed({**only_scaled, **measured})
 
 
 def test_a_model_has_one_scale_by_a_survey_whoever_asks(survey: Survey) -> None:

@@ -18,7 +18,7 @@ from tests.known import known
 from tests.listener import Listener
 from tests.outputs import names_in
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
@@ -52,19 +52,9 @@ def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
 
     It is scaled in half the time that the site frame takes, in which the map has to find its place.
     """
-    folder = walked_survey.folder
-    return Survey().changed(
-        {
-            "images.model": folder / "sparse" / "0",
-            "images.times": folder / "images.csv",
-            "ranges.path": folder / "uwb.csv",
-            "ranges.time_offset": 2.0,
-            "anchors.path": folder / "anchors_first_camera.csv",
-            "anchors.frame": "first_camera",
-            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "output.path": where / "out",
-        }
-    )
+    anchors = walked_survey.folder / "anchors_first_camera.csv"
+    in_camera = {"anchors.path": anchors, "anchors.frame": "first_camera"}
+    return walked_survey.survey(where / "out").changed(in_camera)
 
 
 def in_site_frame(survey: Survey, walked_survey: WalkedSurvey) -> Survey:
@@ -214,7 +204,7 @@ class TestSeveralTags:
     @classmethod
     def made(cls) -> SyntheticModel:
         path, times = loop_path(42.0, start_s=0.0, seed=3), np.arange(1.0, 41.0)
-        return synthetic_model(times, path.centers(times), path.world_from_cam(times), num_observations=60, seed=1)
+        return synthetic_model(*along(path, times), num_observations=60, seed=1)
 
     @pytest.fixture(scope="class")
     @classmethod

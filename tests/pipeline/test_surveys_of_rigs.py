@@ -57,19 +57,19 @@ class StereoSurvey:
         return refine_model(survey, progress=Progress()).summary
 
 
-def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -> StereoSurvey:
+def stereo_survey(folder: Path, *, baseline_error: float = 0.0) -> StereoSurvey:
     """Simulate a stereo survey.
 
     Args:
         baseline_error: relative error of the configured baseline, positive if it is too long.
     """
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=NUM_FRAMES, num_points3D=200
     )
     options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 0.05
     truth = pycolmap.synthesize_dataset(options)
-    write_ranges(folder, truth, np.random.default_rng(seed))
+    write_ranges(folder, truth, np.random.default_rng(0))
     pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), truth)
     model = rescale(truth, Similarity(1 + baseline_error, np.eye(3), np.zeros(3)))
     (folder / "sparse").mkdir()

@@ -72,7 +72,7 @@ def test_two_laps_that_were_mapped_apart_become_one_model(tmp_path: Path) -> Non
 
 
 def test_aisles_that_look_alike_stay_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey = two_aisles(num_keyframes=10, length_m=4.0)
+    survey = two_aisles()
     looped = survey.looped
     names, run = list(looped.survey.model.timestamps_s), run_of(looped, tmp_path)
     monkeypatch.setattr(LoopMatching, "match", lambda *_: survey.alike)

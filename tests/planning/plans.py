@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.estimation.free_fit import GraphBending
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
@@ -27,7 +27,7 @@ def loop(duration_s: float = 60.0, num_keyframes: int = 120, height_amplitude_m:
     path = loop_path(duration_s, unsteadiness_m=0.02, height_amplitude_m=height_amplitude_m, seed=3)
     times = np.linspace(0.0, duration_s, num_keyframes)
     names = tuple(f"{number:04d}.jpg" for number in range(num_keyframes))
-    return Trajectory(np.arange(num_keyframes), names, times, path.centers(times), path.world_from_cam(times))
+    return Trajectory(np.arange(num_keyframes), names, *along(path, times))
 
 
 def free_bend_m(expected: Expected) -> float:

@@ -40,7 +40,7 @@ def bricks(canvas: Canvas, palette: Sequence[Colour] = RED_BRICK, damp_m: float 
     return Material(albedo, height)
 
 
-def plaster(canvas: Canvas, colour: Colour, damp_m: float = 0.7, peeled: float = 0.9) -> Material:
+def plaster(canvas: Canvas, colour: Colour, peeled: float = 0.9) -> Material:
     """Painted plaster with stains and cracks; where it has come off, bricks show (more for a lower ``peeled``)."""
     stains = canvas.fractal(1.3, 5)
     paint = linear(colour) * (1 + 0.10 * stains + 0.05 * canvas.fractal(0.08, 4) + 0.05 * canvas.grain())
@@ -49,14 +49,14 @@ def plaster(canvas: Canvas, colour: Colour, damp_m: float = 0.7, peeled: float =
     paint += (0.5 * repairs) * (linear((170, 164, 152)) - paint)
     low = np.clip(1 - (canvas.height_m - canvas.y) / 1.6, 0, 1)
     gone = smooth_step(peeled, peeled + 0.03, canvas.fractal(0.8, 6) + 0.35 * low)
-    under = bricks(canvas, damp_m=damp_m)
+    under = bricks(canvas, damp_m=0.7)
     albedo = paint + gone * (under.albedo * 0.9 - paint)
-    _weather(canvas, albedo, damp_m)
+    _weather(canvas, albedo, 0.7)
     height = (1 - gone) * 0.012 + gone * under.height_m + 0.0015 * canvas.fractal(0.05, 3)
     return Material(albedo, height)
 
 
-def concrete(canvas: Canvas, board_m: float = 1.25, colour: Colour = (158, 154, 146)) -> Material:
+def concrete(canvas: Canvas, board_m: float = 1.25) -> Material:
     """Cast concrete: marks of the formwork, pores, stains, hairline cracks."""
     pattern = _courses(canvas, height_m=board_m, length_m=2.4, length_variation=0.0, wobble_m=0.0)
     tone = 1 + 0.08 * pattern.per_cell(canvas) + 0.14 * canvas.fractal(0.7, 6) + 0.06 * canvas.grain()
@@ -64,7 +64,7 @@ def concrete(canvas: Canvas, board_m: float = 1.25, colour: Colour = (158, 154, 
     tone *= 1 - 0.25 * _cracks(canvas, 1.5, 0.007)
     pores = smooth_step(0.72, 0.85, canvas.noise(0.014)) * smooth_step(-0.4, 0.6, canvas.fractal(0.4, 3))
     tone *= 1 - 0.55 * pores
-    albedo = linear(colour) * tone
+    albedo = linear((158, 154, 146)) * tone
     patches = smooth_step(0.7, 0.75, canvas.fractal(0.5, 5))
     albedo += (0.35 * patches) * (linear((112, 108, 100)) - albedo)
     _weather(canvas, albedo, 0.4)

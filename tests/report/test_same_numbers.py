@@ -41,17 +41,8 @@ def told(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factor
     out = ("--output_path", folder / "by_command", "--reference", "reference.csv")
     flags = [part if part != str(2.0) else "auto" for part in walked_survey.flags]
     printed = rangesfm_command("refine", *flags, "--anchors", "anchors.csv", *out, cwd=walked).stdout
-    survey = rangesfm.Survey().changed(
-        {
-            "images.model": walked / "sparse" / "0",
-            "images.times": walked / "images.csv",
-            "ranges.path": walked / "uwb.csv",
-            "anchors.path": walked / "anchors.csv",
-            "tag.tag_in_cam_m": (0.03, -0.12, -0.05),
-            "report.reference": walked / "reference.csv",
-            "output.path": folder / "by_python",
-        }
-    )
+    changes = {"ranges.time_offset": "auto", "report.reference": walked / "reference.csv"}
+    survey = walked_survey.survey(folder / "by_python").changed(changes)
     markup = (folder / "by_command" / "report.html").read_text(encoding="utf-8")
     body = re.sub(r"<(script|style).*?</\1>", "", markup, flags=re.DOTALL)
     words = html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</(?:p|dd|dt|td|th|li|h\d)>", "\n", body)))

@@ -58,8 +58,8 @@ def _render_room(folder: Path, num_photos: int, *, seed: int = 0, prefix: str = 
     return Room(folder, names, centers, camera)
 
 
-def _texture(rng: np.random.Generator, size: int = 512) -> npt.NDArray[np.float64]:
-    layers = []
+def _texture(rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    layers, size = [], 512
     for cell in (4, 8, 16, 64):
         noise = Image.fromarray(rng.random((size // cell, size // cell)).astype(np.float32))
         layers.append(np.asarray(noise.resize((size, size), Image.Resampling.BICUBIC), dtype=np.float64))

@@ -12,6 +12,7 @@ from rangesfm.demo.simulated_imu import GRAVITY_M_S2, Grade, simulate_imu
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.util.geometry.trajectory import Trajectory
 
+RATE_HZ = 100.0
 CAM_FROM_IMU = Rotation.from_euler("zyx", (100.0, -20.0, 65.0), degrees=True).as_matrix()
 
 
@@ -108,7 +109,6 @@ def imu_log(
     motion: Motion,
     *,
     offset_s: float = 0.0,
-    rate_hz: float = 100.0,
     until_s: float = 70.0,
     seed: int = 1,
     grade: Grade = CONSTANT,
@@ -119,9 +119,9 @@ def imu_log(
     Args:
         offset_s: image time minus time of the log.
     """
-    times_s = np.arange(0.0, until_s, 1 / rate_hz)
+    times_s = np.arange(0.0, until_s, 1 / RATE_HZ)
     rng = np.random.default_rng(seed)
-    log = simulate_imu(motion.world_from_imu, motion.places_m, times_s, rate_hz, grade, rng, gravity_m_s2)
+    log = simulate_imu(motion.world_from_imu, motion.places_m, times_s, RATE_HZ, grade, rng, gravity_m_s2)
     gyro_zero, accel_zero = ZEROS if grade is CONSTANT else np.zeros((2, 3))
     gyro_rad_s, accel_m_s2 = log.gyro_rad_s + gyro_zero, log.accel_m_s2 + accel_zero
     return ImuLog(times_s - offset_s, gyro_rad_s, accel_m_s2, "imu.csv")

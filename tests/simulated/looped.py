@@ -200,8 +200,6 @@ def two_laps(
     size_m: tuple[float, float],
     num_observations: int = 60,
     pixel_stddev: float = 0.5,
-    max_track_length: int = 8,
-    seed: int = 0,
 ) -> LoopedSurvey:
     """Two laps of a rover around a field, looking ahead, with one anchor that is known in the first camera's frame.
 
@@ -210,7 +208,6 @@ def two_laps(
         size_m: of the field.
         num_observations: features in a keyframe.
         pixel_stddev: of a coordinate of a feature.
-        seed: of points and noise.
     """
     times = np.arange(num_keyframes, dtype=np.float64)
     path = lap_path(times[-1], size_m=size_m, corner_radius_m=min(8.0, 0.2 * min(size_m)), share=2.0)
@@ -223,10 +220,9 @@ def two_laps(
         depth_range_m=(4.0, 25.0),
         pixel_stddev=pixel_stddev,
         metric_from_sfm=IDENTITY,
-        seed=seed,
     )
     anchor = (np.array([0.1 * size_m[0], -0.4 * size_m[1], 4.0]) - centers[0]) @ turns[0]
-    return LoopedSurvey(Truth(model, {"A1": anchor}, "first_camera"), max_track_length)
+    return LoopedSurvey(Truth(model, {"A1": anchor}, "first_camera"), 8)
 
 
 def bent_laps() -> LoopedSurvey:
@@ -247,19 +243,12 @@ class RepeatingSurvey:
     alike: dict[Pair, Matches]
 
 
-def two_aisles(
-    *, num_keyframes: int = 30, length_m: float = 10.0, apart_m: float = 3.0, pixel_stddev: float = 0.5, seed: int = 0
-) -> RepeatingSurvey:
+def two_aisles() -> RepeatingSurvey:
     """Simulate a walk along an aisle, over to the next one and back, looking at the shelves, with four anchors.
 
-    Args:
-        num_keyframes: in each aisle.
-        length_m: of the aisles.
-        apart_m: distance between the aisles.
-        pixel_stddev: of a coordinate of a feature.
-        seed: of points and noise.
+    The aisles are 4 m long with 10 keyframes in each, and 3 m apart. Features have a noise of half a pixel.
     """
-    rng = np.random.default_rng(seed)
+    rng, num_keyframes, length_m, apart_m = np.random.default_rng(0), 10, 4.0, 3.0
     along, over = np.linspace(0.0, length_m, num_keyframes), np.arange(0.4, apart_m - 0.2, 0.4)
     x = np.concatenate([along, np.full(len(over), length_m), along[::-1]])
     y = -np.concatenate([0 * along, over, np.full(num_keyframes, apart_m)])
@@ -279,7 +268,7 @@ def two_aisles(
     sees[:num] &= ~in_second
     sees[num : 2 * num] &= ~in_first
     keep = sees.sum(axis=1) > 1
-    looped = _walk(frames, points[keep], sees[keep], pixel_stddev, rng)
+    looped = _walk(frames, points[keep], sees[keep], 0.5, rng)
     model = looped.truth
     of_point = dict(zip(np.flatnonzero(keep).tolist(), sorted(model.point3D_ids()), strict=True))
     alike: dict[Pair, list[Pair]] = {}
@@ -295,16 +284,12 @@ def two_aisles(
     return RepeatingSurvey(looped, enough)
 
 
-def around_a_room(num_keyframes: int = 60, *, pixel_stddev: float = 1.0, seed: int = 0) -> LoopedSurvey:
-    """Simulate a walk, once around a round room and some way further, looking at its wall.
+def around_a_room() -> LoopedSurvey:
+    """Simulate a walk of 60 keyframes, once around a round room and some way further, looking at its wall.
 
-    Neighbours hold the whole map together, so that a mapper makes one model of them.
-
-    Args:
-        pixel_stddev: of a coordinate of a feature.
-        seed: of points and noise.
+    Neighbours hold the whole map together, so that a mapper makes one model of them. Features have a noise of 1 pixel.
     """
-    rng = np.random.default_rng(seed)
+    rng, num_keyframes = np.random.default_rng(0), 60
     angle, around = np.linspace(0.0, 2.6 * np.pi, num_keyframes), rng.uniform(0.0, 2.0 * np.pi, 1500)
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(num_keyframes)])
     centers = 4.0 * outward + np.array([0.0, 0.0, 1.6])
@@ -314,7 +299,7 @@ def around_a_room(num_keyframes: int = 60, *, pixel_stddev: float = 1.0, seed: i
     frames = Frames(np.arange(float(num_keyframes)), centers, look_at(centers, centers + outward), 500.0, (960, 640))
     sees = _sees(frames, points)
     keep = sees.sum(axis=1) > 1
-    return _walk(frames, points[keep], sees[keep], pixel_stddev, rng)
+    return _walk(frames, points[keep], sees[keep], 1.0, rng)
 
 
 def _sees(frames: Frames, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

@@ -16,6 +16,9 @@ from rangesfm.demo.simulated_radio import CameraPath
 
 FloatArray = npt.NDArray[np.float64]
 
+# How far the ground of a lap goes up and down.
+UNEVENNESS_M = 0.15
+
 
 def look_at(centers_m: FloatArray, targets_m: FloatArray, roll_deg: FloatArray | float = 0.0) -> FloatArray:
     """(n, 3, 3) world_from_cam of upright cameras that look from (n, 3) to (n, 3), then rolled clockwise."""
@@ -27,6 +30,11 @@ def look_at(centers_m: FloatArray, targets_m: FloatArray, roll_deg: FloatArray |
     roll = np.zeros((len(centers_m), 3))
     roll[:, 2] = np.radians(roll_deg)
     return np.asarray(upright @ Rotation.from_rotvec(roll).as_matrix())
+
+
+def along(path: CameraPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return times (n,), centres (n, 3) and world_from_cam (n, 3, 3) of photos on a path, for ``synthetic_model``."""
+    return times, path.centers(times), path.world_from_cam(times)
 
 
 def loop_path(
@@ -83,20 +91,17 @@ def orbit_path(duration_s: float, *, radius_m: float = 5.0, height_amplitude_m: 
     )
 
 
-def sequence_path(
-    duration_s: float, *, speed_m_per_s: float = 1.0, turn_stddev_deg: float = 12.0, seed: int = 0
-) -> CameraPath:
+def sequence_path(duration_s: float, *, speed_m_per_s: float = 1.0, seed: int = 0) -> CameraPath:
     """A way that never returns: ahead along x in bends, over low hills, looking ahead.
 
     Args:
         duration_s: from time 0.
         speed_m_per_s: constant.
-        turn_stddev_deg: stddev of the heading, which wanders around the x axis.
-        seed: of the bends.
+        seed: of the bends; the heading wanders around the x axis with a stddev of 12 degrees.
     """
     rng = np.random.default_rng(seed)
     times = np.linspace(0.0, duration_s, max(8, round(duration_s / 4)))
-    heading = np.radians(turn_stddev_deg) * rng.standard_normal(len(times))
+    heading = np.radians(12.0) * rng.standard_normal(len(times))
     climb = 0.05 * rng.standard_normal(len(times))
     direction = CubicSpline(times, np.stack([np.cos(heading), np.sin(heading), climb], axis=1))
     position = direction.antiderivative()
@@ -109,18 +114,16 @@ def lap_path(
     *,
     size_m: tuple[float, float] = (105.0, 68.0),
     corner_radius_m: float = 8.0,
-    height_m: float = 1.0,
-    unevenness_m: float = 0.15,
     share: float = 0.98,
 ) -> CameraPath:
     """A rover's lap around a soccer field, looking ahead; it ends before it sees the start again.
+
+    The camera is 1 m above uneven ground.
 
     Args:
         duration_s: from time 0, at constant speed.
         size_m: of the field along x and y; its middle is the origin, and the first side runs along +x at -y.
         corner_radius_m: of the turns.
-        height_m: of the camera.
-        unevenness_m: how far the ground goes up and down.
         share: of the lap; more than 1 goes around again.
     """
     sides = [size - 2 * corner_radius_m for size in size_m] * 2
@@ -135,7 +138,7 @@ def lap_path(
     at = share * ends[-1] * times / duration_s
     x, y, turn = (np.interp(at % ends[-1], way, values) for values in (plan[:, 0], plan[:, 1], heading))
     wave = at / corner_radius_m
-    centers = np.column_stack([x, y, height_m + unevenness_m * np.sin(wave)])
-    climb = unevenness_m / corner_radius_m * np.cos(wave)
+    centers = np.column_stack([x, y, 1.0 + UNEVENNESS_M * np.sin(wave)])
+    climb = UNEVENNESS_M / corner_radius_m * np.cos(wave)
     ahead = np.column_stack([np.cos(turn), np.sin(turn), climb])
     return CameraPath.through(times, centers, look_at(centers, centers + ahead))

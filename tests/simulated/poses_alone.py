@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 Garble = Callable[[Array, np.random.Generator], Array]
 
 METRES_PER_UNIT = 0.42
+NUM_PHOTOS = 60
 ANCHORS_M = {"N": (4.6, 3.7, 0.4), "E": (-4.9, 4.1, 2.5), "S": (-4.4, -3.8, 0.5), "W": (5.1, -4.2, 2.3)}
 RANGES = ("--ranges", "uwb.csv", "--ranges_time_offset", "0")
 POSITIONS = ("--positions", "positions.csv")
@@ -43,10 +44,8 @@ class PosesAlone:
 def write_poses_alone(
     folder: Path,
     *,
-    num_photos: int = 60,
     height_amplitude_m: float = 0.5,
     drift_m: float = 0.0,
-    noise_m: float = 0.03,
     garble: Garble = lambda range_m, rng: range_m,
     seed: int = 0,
 ) -> PosesAlone:
@@ -55,13 +54,13 @@ def write_poses_alone(
     Args:
         drift_m: root mean square of a random walk of the poses. garble: changes the ranges as measured.
     """
-    rng, times = np.random.default_rng(seed), np.arange(num_photos, dtype=np.float64)
-    true_m, found_m = _eight(times, num_photos, height_amplitude_m), np.zeros((num_photos, 3))
+    rng, times = np.random.default_rng(seed), np.arange(NUM_PHOTOS, dtype=np.float64)
+    true_m, found_m = _eight(times, height_amplitude_m), np.zeros((NUM_PHOTOS, 3))
     if drift_m:
         walk_m = np.cumsum(rng.standard_normal(true_m.shape), axis=0)
         found_m = drift_m * walk_m / np.sqrt(np.mean(np.sum(walk_m**2, axis=1)))
     found_m = found_m + true_m
-    ahead = _eight(times + 0.1, num_photos, height_amplitude_m)
+    ahead = _eight(times + 0.1, height_amplitude_m)
     turn = Rotation.random(rng=rng).as_matrix()
     centers = found_m @ turn.T / METRES_PER_UNIT
     _write_model(folder / "sparse" / "0", centers, turn @ look_at(true_m, ahead))
@@ -69,17 +68,17 @@ def write_poses_alone(
     rows = ((name, *at_m) for name, at_m in zip(_names(times), true_m.tolist(), strict=True))
     write_rows(folder / "positions.csv", "image_name,x_m,y_m,z_m", rows)
     write_anchors(folder / "anchors.csv", ANCHORS_M)
-    at_s = np.repeat(np.arange(0.0, num_photos - 1, 0.25), len(ANCHORS_M))
+    at_s = np.repeat(np.arange(0.0, NUM_PHOTOS - 1, 0.25), len(ANCHORS_M))
     names = np.tile(list(ANCHORS_M), len(at_s) // len(ANCHORS_M))
-    from_anchor = _eight(at_s, num_photos, height_amplitude_m) - [ANCHORS_M[name] for name in names]
-    range_m = np.linalg.norm(from_anchor, axis=1) + noise_m * rng.standard_normal(len(at_s))
+    from_anchor = _eight(at_s, height_amplitude_m) - [ANCHORS_M[name] for name in names]
+    range_m = np.linalg.norm(from_anchor, axis=1) + 0.03 * rng.standard_normal(len(at_s))
     measured = zip(at_s.tolist(), names.tolist(), garble(range_m, rng).tolist(), strict=True)
     write_rows(folder / "uwb.csv", "timestamp_s,anchor_id,range_m", measured)
     return PosesAlone(folder, align_points(centers, true_m).scale)
 
 
-def _eight(times_s: Array, duration_s: float, height_amplitude_m: float) -> Array:
-    angle = 2 * np.pi * times_s / duration_s
+def _eight(times_s: Array, height_amplitude_m: float) -> Array:
+    angle = 2 * np.pi * times_s / NUM_PHOTOS
     sides = [3.0 * np.cos(angle), 2.0 * np.sin(2 * angle), 1.5 + height_amplitude_m * np.sin(3 * angle)]
     return np.column_stack(sides)
 

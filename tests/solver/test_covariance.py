@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import look_at, orbit_path
+from tests.simulated.path import along, look_at, orbit_path
 
 from rangesfm.errors import GeometryError
 from rangesfm.solver import (
@@ -102,9 +102,7 @@ def model(seed: int = 0, num_frames: int = NUM_FRAMES) -> pycolmap.Reconstructio
     times = np.arange(num_frames, dtype=np.float64)
     path = orbit_path(1.4 * num_frames)
     return synthetic_model(
-        times,
-        path.centers(times),
-        path.world_from_cam(times),
+        *along(path, times),
         num_observations=30,
         pixel_stddev=1.0,
         metric_from_sfm=IDENTITY,

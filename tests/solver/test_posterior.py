@@ -13,7 +13,7 @@ from rangesfm.measurements.mistakes import Mistake, estimated
 from rangesfm.solver.bending import Bending, bending_parts
 from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.noise import Component, learnt_sizes, noise_of_sizes
-from rangesfm.solver.posterior import JointProblem, Observations, joined
+from rangesfm.solver.posterior import Observations, joined
 from rangesfm.util.geometry.trajectory import Trajectory
 
 NUM_POSES = 4
@@ -60,7 +60,7 @@ def two_kinds() -> tuple[Observations, Observations]:
     return kind("positions", 12, 0, 0.2, shared=0.1), kind("lengths", 3, 1, 0.05, is_placed=False)
 
 
-def dense(problem: JointProblem, *kinds: Observations) -> tuple[Array, Array, Array]:
+def dense(*kinds: Observations) -> tuple[Array, Array, Array]:
     """Return design, residuals and covariance of all observations, in which the map bends alike."""
     design = np.zeros((sum(len(each.residual_m) for each in kinds), 7))
     design[:12], design[12:, :1] = kinds[0].design, kinds[1].design
@@ -72,7 +72,7 @@ def dense(problem: JointProblem, *kinds: Observations) -> tuple[Array, Array, Ar
 def test_the_best_estimate_of_two_kinds_is_that_of_dense_least_squares() -> None:
     kinds = two_kinds()
     problem = joined(kinds, Shaken())
-    design, residual, covariance = dense(problem, *kinds)
+    design, residual, covariance = dense(*kinds)
     np.testing.assert_allclose(problem.noise.covariance_m2, covariance)
     found = problem.solved(problem.noise.covariance_m2)
     inverse = np.linalg.inv(covariance)
@@ -90,7 +90,7 @@ def test_another_kind_never_widens_the_interval() -> None:
 def test_a_mistake_is_found_with_its_size_also_where_it_is_not_used() -> None:
     kinds = two_kinds()
     problem = joined(kinds, Shaken())
-    design, _, _ = dense(problem, *kinds)
+    design, _, _ = dense(*kinds)
     columns = np.zeros((15, 1))
     columns[3] = 1.0
     exact = replace(problem, residual_m=design @ np.arange(7.0) - 0.8 * columns[:, 0])
@@ -124,7 +124,7 @@ def test_what_nobody_observes_is_as_certain_as_its_conditional_distribution() ->
     found = problem.predicted_m2("keyframes", problem.posterior().covariance)
     # With nearly nothing known of the unknowns beforehand.
     prior = 1e6 * np.eye(7)
-    design, _, _ = dense(problem, *kinds)
+    design, _, _ = dense(*kinds)
     design = np.vstack([design, unseen.design])
     covariance = problem.noise.covariance_m2 + design @ prior @ design.T
     seen, other = slice(0, 15), slice(15, 17)

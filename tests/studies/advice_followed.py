@@ -51,7 +51,7 @@ def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
 
 
 def main() -> None:
-    asked = seeds_parser(__doc__, list(SURVEYS), 100).parse_args()
+    asked = seeds_parser(__doc__, SURVEYS, 100).parse_args()
     print(f"{'survey':30}{'for':>6}{'promised':>20}{'followed':>20}{'ratio':>14}  advice")
     off = []
     for name in asked.kinds:

@@ -210,7 +210,7 @@ def size_of(line: Line) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", nargs="*", default=list(ROOMS))
+    parser.add_argument("--rooms", nargs="*", default=ROOMS, choices=ROOMS, metavar="NAME")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     kept, runs = KeptRuns(args.out, "number"), surveys()

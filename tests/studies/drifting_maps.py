@@ -343,11 +343,11 @@ def report(lines: list[Line]) -> Iterator[str]:
 
 
 def main() -> int:
-    parser = seeds_parser(__doc__, None, 6)
+    parser = seeds_parser(__doc__, [*surveys(Path()), *WITHOUT_RANGES], 6)
     parser.add_argument("--data", type=Path)
     asked = parser.parse_args()
-    kinds = asked.kinds or [*surveys(asked.data), *WITHOUT_RANGES]
-    lines = [line for kind in kinds for line in runs_of(asked, kind, partial(told, kind, data=asked.data))]
+    there = [kind for kind in asked.kinds if kind in WITHOUT_RANGES or kind in surveys(asked.data)]
+    lines = [line for kind in there for line in runs_of(asked, kind, partial(told, kind, data=asked.data))]
     print(*report(lines), sep="\n")
     covered = [line["covered"] for line in lines if not line["refused"]]
     return int(not covered or float(np.mean(covered)) < LEAST_COVERED)

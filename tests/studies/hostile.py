@@ -41,6 +41,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from filelock import FileLock
 from pydantic.fields import FieldInfo
+from tests.simulated.files import write_marks
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.colmap.model_files import read_model
@@ -547,13 +548,8 @@ def make_template(folder: Path) -> None:
         positions.append(f"{time - TIME_OFFSET_S:.3f},{x:.3f},{y:.3f},{z:.3f}")
     (survey / "tag.csv").write_text("\n".join(positions) + "\n")
     model = read_model(survey / "out" / "sparse" / "0")
-    point = max(model.points3D.values(), key=lambda point: point.track.length())
-    marks = []
-    for element in point.track.elements:
-        image = model.images[element.image_id]
-        x, y = image.points2D[element.point2D_idx].xy.tolist()
-        marks.append(f"m,{image.name},{x!r},{y!r}")
-    (survey / "markers.csv").write_text("\n".join(["marker,image_name,x_px,y_px", *marks]) + "\n")
+    longest = max(model.points3D, key=lambda point_id: model.point3D(point_id).track.length())
+    write_marks(survey / "markers.csv", model, {"m": longest})
     length_m = float(np.linalg.norm(path_m[0] - path_m[-1]))
     (survey / "distances.csv").write_text(f"from,to,distance_m,stddev_m\n{names[0]},{names[-1]},{length_m},0.05\n")
     curve = "".join(f"{distance},0.02,0.01,0.03\n" for distance in (1.0, 4.0, 9.0, 20.0))

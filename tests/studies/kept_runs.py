@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,10 +45,14 @@ class KeptRuns:
         return self._done[key]
 
 
-def seeds_parser(doc: str | None, kinds: Sequence[str] | None, num_seeds: int) -> argparse.ArgumentParser:
-    """Return the command line of a study that runs kinds of surveys, each with many seeds."""
+def seeds_parser(doc: str | None, kinds: Collection[str] | None, num_seeds: int) -> argparse.ArgumentParser:
+    """Return the command line of a study that runs kinds of surveys, each with many seeds.
+
+    Args:
+        kinds: those that there are, by default all; None: any word may be given.
+    """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", default=kinds)
+    parser.add_argument("--kinds", nargs="+", default=kinds, choices=kinds, metavar="NAME")
     parser.add_argument("--num_seeds", type=int, default=num_seeds)
     parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("--out", type=Path, help="keeps the runs, which are not made again")

@@ -286,7 +286,8 @@ def summary_of(lines: Sequence[Line]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
-    parser = seeds_parser(__doc__, KINDS_OF_SURVEY, 15)
+    parser = seeds_parser(__doc__, KINDS, 15)
+    parser.set_defaults(kinds=KINDS_OF_SURVEY)
     parser.add_argument("--with", nargs="+", default=["points"], dest="known")
     parser.add_argument("--mistakes", nargs="+", default=["none"], choices=MISTAKES)
     asked = parser.parse_args(arguments)

@@ -227,7 +227,7 @@ def report(lines: list[Line]) -> Iterator[str]:
 
 
 def main() -> int:
-    asked = seeds_parser(__doc__, list(KINDS), 20).parse_args()
+    asked = seeds_parser(__doc__, KINDS, 20).parse_args()
     lines = [line for kind in asked.kinds for line in runs_of(asked, kind, partial(told, kind))]
     print(*report(lines), sep="\n")
     share, _, _ = share_covered([line for line in lines if not line["refused"]], "marks")

@@ -316,7 +316,8 @@ def _swap(first: str, second: str, given: MadeSurvey, size: float, rng: np.rando
 
 
 def main() -> None:
-    parser = seeds_parser(__doc__, [""], 20)
+    parser = seeds_parser(__doc__, None, 20)
+    parser.set_defaults(kinds=[""])
     parser.add_argument("--report", action="store_true", help="tell what the file holds, and run nothing")
     parser.add_argument("--num_clean", type=int, default=67, help="of each simulated survey")
     parser.add_argument("--surveys", default="", help="only those whose name begins so")

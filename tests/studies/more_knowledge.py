@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from tests.simulated.runs import NO_RANGES
 from tests.simulated.surveys import model_of_poses
-from tests.studies import real_logs
 from tests.studies.known_positions import antenna_track
+from tests.studies.real_logs import FACTOR, SETS, RealLog
 
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
@@ -60,12 +59,10 @@ class Measured:
 
     @classmethod
     def of(cls, data: Path, name: str, frame: str) -> Measured:
-        described = json.loads(Path(real_logs.__file__).with_suffix(".json").read_text(encoding="utf-8"))[name]
-        log, anchors, reference = real_logs.read_set(data, described)
-        path, rng = real_logs.path_of(reference), np.random.default_rng(0)
-        case = next(each for each in real_logs.cases(log, anchors, path) if each.name == frame)
-        observations = real_logs.placed(log, case, path, described, by_photo=False)
-        true_m = real_logs.FACTOR * path.centers
+        real, rng = RealLog.read(data, name), np.random.default_rng(0)
+        path, case = real.path, real.case(frame)
+        observations = real.placed(case, path)
+        true_m = FACTOR * path.centers
         rows = np.linspace(0, len(path) - 1, NUM_POSITIONS).round().astype(np.int64)
         at_m = true_m[rows] + POSITION_STDDEV_M * rng.standard_normal((len(rows), 3))
         names = path.image_names
@@ -101,18 +98,17 @@ class Measured:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--sets", nargs="*")
+    parser.add_argument("--sets", nargs="*", choices=SETS, metavar="NAME")
     args = parser.parse_args()
-    sets = json.loads(Path(real_logs.__file__).with_suffix(".json").read_text(encoding="utf-8"))
     runs = [("surveyed", kinds) for kinds in COMBINATIONS] + [("known", ("ranges",)), ("unknown", ("ranges",))]
     found: dict[str, list[float]] = {}
-    for name in args.sets or sets:
+    for name in args.sets or SETS:
         words = []
         for frame, kinds in runs:
             estimate = Measured.of(args.data, name, frame).estimate(kinds)
             half, error = np.nan, np.nan
             if estimate is not None:
-                half, error = estimate.uncertainty.half_width_95, float(np.log(estimate.value / real_logs.FACTOR))
+                half, error = estimate.uncertainty.half_width_95, float(np.log(estimate.value / FACTOR))
             run = "+".join(kinds) if frame == "surveyed" else f"{frame} anchors"
             found.setdefault(run, []).append(half)
             words.append(f"{run} {100 * half:.2f} ({100 * error:+.2f})")

@@ -122,7 +122,7 @@ def rms(stddevs: Expected) -> float:
 
 
 def main() -> None:
-    asked = seeds_parser(__doc__, list(SURVEYS), 40).parse_args()
+    asked = seeds_parser(__doc__, SURVEYS, 40).parse_args()
     print(f"{'survey':30}{'poses':>9}{'planned':>10}{'spread':>9}{'ratio':>16}{'bend':>10}{'spread':>9}{'ratio':>16}")
     for name in asked.kinds:
         make, seen, pixel_stddev = SURVEYS[name]

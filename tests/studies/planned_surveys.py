@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from tests.estimation.scale.conftest import lengths_among
-from tests.simulated.path import lap_path, loop_path, sequence_path
+from tests.simulated.path import along, lap_path, loop_path, sequence_path
 from tests.simulated.radio_errors import errors_of_radio
 from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
 from tests.studies import kept_runs
@@ -76,10 +76,10 @@ YARD = ((17.0, 2.0, 6.0), (-16.0, 3.0, 1.0), (1.0, 16.0, 9.0), (-2.0, -17.0, 2.0
 TAG_IN_CAM_M = (0.05, -0.1, -0.05)
 
 
-def along(path: CameraPath, photo_rate_hz: float = 2.0) -> Trajectory:
+def photographed(path: CameraPath, photo_rate_hz: float = 2.0) -> Trajectory:
     times = np.arange(path.start_s, path.end_s, 1 / photo_rate_hz)
     names = tuple(f"{k:05d}.jpg" for k in range(len(times)))
-    return Trajectory(np.arange(1, len(times) + 1), names, times, path.centers(times), path.world_from_cam(times))
+    return Trajectory(np.arange(1, len(times) + 1), names, *along(path, times))
 
 
 def survey(
@@ -92,7 +92,7 @@ def survey(
 
 
 def walk(**options: Any) -> Trajectory:
-    return along(loop_path(90.0, unsteadiness_m=0.2, **{"seed": 3, **options}))
+    return photographed(loop_path(90.0, unsteadiness_m=0.2, **{"seed": 3, **options}))
 
 
 def up_and_down() -> Trajectory:
@@ -104,16 +104,19 @@ def straight(length_m: float = 20.0) -> Trajectory:
 
 
 def flight() -> Trajectory:
-    return along(loop_path(100.0, center_m=(0, 0, 6), semi_axes_m=(10, 7), height_amplitude_m=2.5, num_turns=2.1,
-                           unsteadiness_m=1.0, seed=5))  # fmt: skip
+    path = loop_path(
+        100.0, center_m=(0, 0, 6), semi_axes_m=(10, 7), height_amplitude_m=2.5, num_turns=2.1, unsteadiness_m=1.0,
+        seed=5,
+    )  # fmt: skip
+    return photographed(path)
 
 
 def lap() -> Trajectory:
-    return along(lap_path(200.0), 1.0)
+    return photographed(lap_path(200.0), 1.0)
 
 
 def onward() -> Trajectory:
-    return along(sequence_path(60.0, speed_m_per_s=0.4, seed=2))
+    return photographed(sequence_path(60.0, speed_m_per_s=0.4, seed=2))
 
 
 SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
@@ -250,7 +253,7 @@ def runs_of(asked: argparse.Namespace, name: str, planned: PlannedSurvey, num_wh
 
 
 def main() -> None:
-    asked = seeds_parser(__doc__, list(SURVEYS), 100).parse_args()
+    asked = seeds_parser(__doc__, SURVEYS, 100).parse_args()
     print(
         f"{'survey':34}{'predicted':>10}{'stated':>9}{'ratio':>7}{'spread':>9}{'ratio':>14}{'place':>10}{'spread':>9}"
         f"{'ratio':>14}{'refused':>9}"

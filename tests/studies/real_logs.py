@@ -51,6 +51,7 @@ from rangesfm.util.geometry.similarity import Similarity, rmse
 from rangesfm.util.geometry.trajectory import Trajectory
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
+SETS: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
@@ -62,56 +63,115 @@ class Case:
     anchors: list[Anchor]
 
 
+@dataclass(frozen=True)
+class RealLog:
+    """A log, its anchors as surveyed, and the true path in another unit.
+
+    Attributes:
+        described: its entry in real_logs.json.
+    """
+
+    described: dict[str, Any]
+    log: RangeLog
+    anchors: list[Anchor]
+    path: Trajectory
+
+    @classmethod
+    def read(cls, data: Path, name: str) -> RealLog:
+        described = SETS[name]
+        ranges = data / described["ranges"]
+        if "truth" in described:
+            anchors = list(read_anchors(data / described["anchors"]))
+            reference = read_reference(data / described["truth"])
+        else:  # STAR-loc: the tag's position is beside each range, and the anchors' ids are in a column without a name
+            table = rows(data / described["anchors"])
+            anchors = [Anchor(row[""], np.array([float(row[a]) for a in "xyz"])) for row in table]
+            times, first = np.unique([float(row["time_s"]) for row in rows(ranges)], return_index=True)
+            places = np.array([[float(row[f"tag_pos_{a}"]) for a in "xyz"] for row in rows(ranges)])
+            reference = Reference(places[first], ByTime(times))
+        log = read_ranges(ranges, anchor_ids=[anchor.anchor_id for anchor in anchors])
+        return cls(described, log, anchors, path_of(reference))
+
+    def cases(self) -> Iterator[Case]:
+        heard = [anchor for anchor in self.anchors if anchor.anchor_id in self.log.anchor_ids]
+        yield Case("surveyed", "site", heard)
+        turn, origin = self.path.world_from_cam[0], FACTOR * self.path.centers[0]
+        from_there = [replace(a, position_m=(np.asarray(a.position_m) - origin) @ turn) for a in heard]
+        yield Case("known", "first_camera", from_there)
+        yield Case("unknown", "unknown", heard)
+        for anchor in heard:
+            yield Case(f"only {anchor.anchor_id}", "unknown", [anchor])
+
+    def case(self, name: str) -> Case:
+        return next(case for case in self.cases() if case.name == name)
+
+    def placed(self, case: Case, path: Trajectory, *, by_photo: bool = False) -> RangeObservations:
+        """Return the ranges to the anchors of a case on the true path, or on the same in another world."""
+        wanted = [anchor.anchor_id for anchor in case.anchors]
+        part = self.log.subset(np.isin(np.array(self.log.anchor_ids)[self.log.anchor_index], wanted))
+        arms: npt.ArrayLike = self.described.get("tag_in_body_m", (0.0, 0.0, 0.0))
+        if "tags_in_body_m" in self.described:
+            arms = [self.described["tags_in_body_m"][tag] for tag in part.tag_ids]
+        offset_s = self.described.get("time_offset_s", 0.0)
+        if by_photo:
+            part, path, offset_s = at_photos(part, path, offset_s)
+        options = RangesOptions(max_interpolation_gap_s=max(self.described.get("max_gap_s", 0.0), MAX_GAP_S))
+        return associate(part, path, arms, time_offset_s=offset_s, options=options)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the scale stage gives of a case.
+
+    Attributes:
+        error: of the scale's logarithm. low, high: its 95 % interval about the estimate. num_named: mistakes.
+        away_m: root mean square error of the path in the site; None where it is not placed there.
+    """
+
+    error: float
+    low: float
+    high: float
+    num_named: int
+    away_m: float | None
+
+    @property
+    def is_covered(self) -> bool:
+        return self.low <= -self.error <= self.high
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--sets", nargs="*")
+    parser.add_argument("--sets", nargs="*", choices=SETS, metavar="NAME")
     parser.add_argument("--no_singles", action="store_true")
     parser.add_argument("--by_photo", action="store_true")
     parser.add_argument("--turned", type=int)
     parser.add_argument("--leave_radio_out", action="store_true")
     parser.add_argument("--calibrated", action="store_true")
     args = parser.parse_args()
-    sets = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
     found = []
-    for name in args.sets or [name for name in sets if not args.calibrated or "same_radio" in sets[name]]:
-        log, anchors, reference = read_set(args.data, sets[name])
+    for name in args.sets or [name for name in SETS if not args.calibrated or "same_radio" in SETS[name]]:
+        real = RealLog.read(args.data, name)
         if args.calibrated:
-            log = correct_ranges(log, curve_of(args.data, sets[sets[name]["same_radio"]]))[0]
-        path = path_of(reference)
-        given = path if args.turned is None else turned(path, args.turned)
+            curve = curve_of(RealLog.read(args.data, real.described["same_radio"]))
+            real = replace(real, log=correct_ranges(real.log, curve)[0])
+        given = real.path if args.turned is None else turned(real.path, args.turned)
         expected = components(population(without=name if args.leave_radio_out else None))
-        for case in cases(log, anchors, path):
+        for case in real.cases():
             if not (args.no_singles and case.name.startswith("only")):
-                observations = placed(log, case, given, sets[name], by_photo=args.by_photo)
+                observations = real.placed(case, given, by_photo=args.by_photo)
                 with patch("rangesfm.measurements.ranges.errors.learned.COMPONENTS", expected):
                     found.append(one_survey(name, case, observations, given))
-    known = np.array([row for row in found if row is not None], dtype=np.float64)
-    if len(known):
-        errors, low, high, num_named, away_m = known.T
-        half_widths = (high - low) / 2
-        from_middle = 1.96 * (errors + (low + high) / 2) / half_widths
+    if known := [outcome for outcome in found if outcome is not None]:
+        half_widths = np.array([(outcome.high - outcome.low) / 2 for outcome in known])
+        from_middle = 1.96 * np.array([each.error + (each.low + each.high) / 2 for each in known]) / half_widths
+        away_m = [outcome.away_m for outcome in known if outcome.away_m is not None]
         print(
-            f"{len(known)} of {len(found)}: {100 * np.mean((low <= -errors) & (-errors <= high)):.0f} % covered, the "
+            f"{len(known)} of {len(found)}: {100 * np.mean([each.is_covered for each in known]):.0f} % covered, the "
             f"truth from the middle in stddevs {np.sqrt(np.mean(from_middle**2)):.2f} (rms), median half width "
-            f"{100 * np.median(half_widths):.2f} %, a mistake named in {np.count_nonzero(num_named)}; paths in a "
-            f"site off by {np.nanmedian(away_m):.2g} m (median)"
+            f"{100 * np.median(half_widths):.2f} %, a mistake named in {sum(each.num_named > 0 for each in known)}"
+            + (f"; {len(away_m)} paths in a site off by {np.median(away_m):.2g} m (median)" if away_m else "")
         )
-
-
-def read_set(data: Path, described: dict[str, Any]) -> tuple[RangeLog, list[Anchor], Reference]:
-    ranges = data / described["ranges"]
-    if "truth" in described:
-        anchors = list(read_anchors(data / described["anchors"]))
-        reference = read_reference(data / described["truth"])
-    else:  # STAR-loc: the tag's position is beside each range, and the anchors' ids are in a column without a name
-        anchors = [
-            Anchor(row[""], np.array([float(row[a]) for a in "xyz"])) for row in rows(data / described["anchors"])
-        ]
-        times, first = np.unique([float(row["time_s"]) for row in rows(ranges)], return_index=True)
-        places = np.array([[float(row[f"tag_pos_{a}"]) for a in "xyz"] for row in rows(ranges)])
-        reference = Reference(places[first], ByTime(times))
-    return read_ranges(ranges, anchor_ids=[anchor.anchor_id for anchor in anchors]), anchors, reference
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -135,32 +195,6 @@ def turned(path: Trajectory, seed: int) -> Trajectory:
     return path.transformed(Similarity(1.0, Rotation.random(random_state=seed).as_matrix(), np.array([3.0, -2.0, 1.0])))
 
 
-def cases(log: RangeLog, anchors: list[Anchor], path: Trajectory) -> Iterator[Case]:
-    heard = [anchor for anchor in anchors if anchor.anchor_id in log.anchor_ids]
-    yield Case("surveyed", "site", heard)
-    turn, origin = path.world_from_cam[0], FACTOR * path.centers[0]
-    from_there = [replace(a, position_m=(np.asarray(a.position_m) - origin) @ turn) for a in heard]
-    yield Case("known", "first_camera", from_there)
-    yield Case("unknown", "unknown", heard)
-    for anchor in heard:
-        yield Case(f"only {anchor.anchor_id}", "unknown", [anchor])
-
-
-def placed(
-    log: RangeLog, case: Case, path: Trajectory, described: dict[str, Any], *, by_photo: bool
-) -> RangeObservations:
-    wanted = [anchor.anchor_id for anchor in case.anchors]
-    part = log.subset(np.isin(np.array(log.anchor_ids)[log.anchor_index], wanted))
-    arms: npt.ArrayLike = described.get("tag_in_body_m", (0.0, 0.0, 0.0))
-    if "tags_in_body_m" in described:
-        arms = [described["tags_in_body_m"][tag] for tag in part.tag_ids]
-    offset_s = described.get("time_offset_s", 0.0)
-    if by_photo:
-        part, path, offset_s = at_photos(part, path, offset_s)
-    options = RangesOptions(max_interpolation_gap_s=max(described.get("max_gap_s", 0.0), MAX_GAP_S))
-    return associate(part, path, arms, time_offset_s=offset_s, options=options)
-
-
 def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLog, Trajectory, float]:
     """Keep the ranges within 50 ms of a pose, and refer to it by its name instead of the time."""
     times = log.timestamp_s + offset_s
@@ -170,22 +204,14 @@ def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLo
     return replace(log.subset(near), moments=ByPhoto(names)), replace(path, timestamps_s=None), 0.0
 
 
-def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
-    log, anchors, reference = read_set(data, described)
-    path = path_of(reference)
-    observations = placed(log, next(cases(log, anchors, path)), path, described, by_photo=False)
+def curve_of(real: RealLog) -> ErrorCurve:
+    observations = real.placed(real.case("surveyed"), real.path)
     tags_m = FACTOR * observations.centers + observations.tag_from_center
-    return calibrate_ranges(observations.log, tags_m, anchors).curve
+    return calibrate_ranges(observations.log, tags_m, real.anchors).curve
 
 
-def one_survey(
-    name: str, case: Case, observations: RangeObservations, path: Trajectory
-) -> tuple[float, float, float, int, float | None] | None:
-    """Return the error of the scale's logarithm, its interval about the estimate, and the number of mistakes named.
-
-    The last number is the root mean square error of the path in the site, metres; None where it is not placed there.
-    None if refused.
-    """
+def one_survey(name: str, case: Case, observations: RangeObservations, path: Trajectory) -> Outcome | None:
+    """Find the scale, and print what was found; return None if it is refused."""
     began = time.process_time()
     options = ScaleOptions(max_relative_stddev=1.0)
     try:
@@ -195,17 +221,20 @@ def one_survey(
     except GeometryError as refusal:
         print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
         return None
-    error, (low, high) = float(np.log(found.value / FACTOR)), found.uncertainty.interval_95
+    away_m = found.metric_from_sfm.apply(path.centers) - FACTOR * path.centers
+    outcome = Outcome(
+        float(np.log(found.value / FACTOR)), *found.uncertainty.interval_95, len(causes),
+        rmse(away_m) if found.frame == "site" else None,
+    )  # fmt: skip
     seconds = time.process_time() - began
     largest = sorted(found.uncertainty.components.items(), key=lambda part: -part[1])[:3]
     print(
-        f"{name:16}{case.name:10}{100 * error:+7.2f} %, truth within {100 * low:+6.2f} to {100 * high:+6.2f} % "
-        f"{'covered' if low <= -error <= high else 'MISSED '} {found.verdict:9}"
+        f"{name:16}{case.name:10}{100 * outcome.error:+7.2f} %, truth within {100 * outcome.low:+6.2f} to "
+        f"{100 * outcome.high:+6.2f} % {'covered' if outcome.is_covered else 'MISSED '} {found.verdict:9}"
         f"{seconds:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}; {causes}",
         flush=True,
     )
-    away_m = found.metric_from_sfm.apply(path.centers) - FACTOR * path.centers
-    return error, low, high, len(causes), rmse(away_m) if found.frame == "site" else None
+    return outcome
 
 
 def judged(found: ScaleEstimate, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:

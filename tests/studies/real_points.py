@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.files import write_marks, write_rows
 
 from rangesfm.pipeline.run import refine_model
 from rangesfm.survey.settings import Survey
@@ -47,12 +48,6 @@ def spread_points(model: pycolmap.Reconstruction, num: int, seed: int) -> list[i
     return [ids[k] for k in chosen]
 
 
-def pixels_of(model: pycolmap.Reconstruction, point_id: int) -> dict[str, Array]:
-    """Return the features of a point, by photo."""
-    images = ((model.image(e.image_id), e.point2D_idx) for e in model.point3D(point_id).track.elements)
-    return {image.name: np.ravel(image.points2D[index].xy) for image, index in images}
-
-
 def triangulated(rays: Array, centers_m: Array) -> Array:
     """Return the point (3,) with the least squared distance from rays (n, 3) of length 1."""
     across = np.eye(3) - rays[:, :, None] * rays[:, None]
@@ -74,24 +69,22 @@ def main() -> int:
         model=given["camera_model"], width=given["width"], height=given["height"], params=given["params"]
     )
     row_of = {name: row for row, name in enumerate(truth.moments.image_name)}
-    points, marks, true_m, ids = "", "", [], spread_points(model, asked.num_points, asked.seed)
-    for number, point_id in enumerate(ids):
-        seen = pixels_of(model, point_id)
-        rows = [row_of[name] for name in seen]
-        rays = np.column_stack([camera.cam_from_img(np.array([*seen.values()])), np.ones(len(rows))])
+    marked = {f"P{number}": i for number, i in enumerate(spread_points(model, asked.num_points, asked.seed))}
+    true_m = []
+    for point_id in marked.values():
+        seen = [(model.image(e.image_id), e.point2D_idx) for e in model.point3D(point_id).track.elements]
+        rows = [row_of[image.name] for image, _ in seen]
+        pixels = np.array([image.points2D[index].xy for image, index in seen])
+        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])
         rays = np.einsum("nij,nj->ni", truth.world_from_cam[rows], rays / np.linalg.norm(rays, axis=1)[:, None])
         true_m.append(triangulated(rays, truth.positions_m[rows]))
-        x_m, y_m, z_m = true_m[-1].tolist()
-        points += (
-            f"P{number},{x_m:.5f},{y_m:.5f},{z_m:.5f},{STDDEV_M},{'control' if number < NUM_CONTROL else 'check'}\n"
-        )
-        marks += "".join(f"P{number},{name},{x_px:.3f},{y_px:.3f}\n" for name, (x_px, y_px) in seen.items())
-    places = np.array([model.point3D(i).xyz for i in ids])
+    places = np.array([model.point3D(i).xyz for i in marked.values()])
     by_photos_m = rmse(align_points(places, np.array(true_m)).apply(places) - np.array(true_m))
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        (folder / "points.csv").write_text(f"marker,x_m,y_m,z_m,stddev_m,kind\n{points}")
-        (folder / "marks.csv").write_text(f"marker,image_name,x_px,y_px\n{marks}")
+        folder, kinds = Path(scratch), ["control"] * NUM_CONTROL + ["check"] * (len(marked) - NUM_CONTROL)
+        points = [(name, *at.tolist(), STDDEV_M, kind) for name, at, kind in zip(marked, true_m, kinds, strict=True)]
+        write_rows(folder / "points.csv", "marker,x_m,y_m,z_m,stddev_m,kind", points)
+        write_marks(folder / "marks.csv", model, marked)
         values = {
             "images.model": asked.model,
             "points.path": folder / "points.csv",

@@ -186,7 +186,7 @@ def cross_matrix(v: Array) -> Array:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Refined scale against the Cramer-Rao bound.")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num_seeds", type=int, default=50)
     num_seeds = parser.parse_args().num_seeds
     print(f"{num_seeds} seeds, {PIXEL_STDDEV} px, {RANGE_STDDEV_M} m; scale errors in percent")

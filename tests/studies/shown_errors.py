@@ -3,19 +3,18 @@
 Run: python -m tests.studies.shown_errors --data FOLDER
 
 The components are learnt as in a survey, but at the true scale and from the same start for all logs. They are the
-columns of the table in ``rangesfm/ranging/errors/components.py``. The logs are those of ``real_logs.json``.
+columns of the table in ``rangesfm/measurements/ranges/errors/components.py``. The logs are those of ``real_logs.json``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
+from tests.studies.real_logs import FACTOR, SETS, RealLog
 
 from rangesfm.measurements.ranges.errors.components import components
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
@@ -44,23 +43,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     args = parser.parse_args()
-    sets = json.loads(Path(__file__).with_name("real_logs.json").read_text(encoding="utf-8"))
     start = components({name: (size, OF_WHITE if name == "white" else SPREAD) for name, size in START.items()})
     likeliest = patch("rangesfm.solver.noise.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs))
     with patch("rangesfm.measurements.ranges.errors.learned.COMPONENTS", start), likeliest:
-        for name, described in sets.items():
-            found = shown(args.data, described)
+        for name in SETS:
+            found = shown(RealLog.read(args.data, name))
             print(f"{name:17}" + "  ".join(f"{part} {stddev:.4f}" for part, stddev in found.items()), flush=True)
 
 
-def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
+def shown(real: RealLog) -> dict[str, float]:
     """Return the stddevs of a log by component."""
-    log, anchors, reference = read_set(data, described)
-    path = path_of(reference)
-    case = next(case for case in cases(log, anchors, path) if case.name == "known")
-    observations = placed(log, case, path, described, by_photo=False)
-    bending = WalkBending(path)
-    posed = scale_problem(RangesOnPath(observations, bending, case.anchors, case.frame))
+    case = real.case("known")
+    observations = real.placed(case, real.path)
+    posed = scale_problem(RangesOnPath(observations, WalkBending(real.path), case.anchors, case.frame))
     solved = solve_scale(posed)
     state = solved.state
     true = replace(

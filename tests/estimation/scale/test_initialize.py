@@ -161,9 +161,9 @@ class TestWithOutliers:
 class TestRefused:
     """Surveys that end with a GeometryError whose text names what is wrong."""
 
-    def refuse(self, survey: Survey, frame: str, known: str, match: str, log: RangeLog | None = None) -> None:
+    def refuse(self, survey: Survey, frame: str, known: str, match: str) -> None:
         with pytest.raises(GeometryError, match=match):
-            survey.scale(frame, known, log)
+            survey.scale(frame, known)
 
     @pytest.mark.parametrize(
         ("frame", "known", "match"),
@@ -334,12 +334,12 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
     assert np.all(np.isnan(second.ranges.errors.stddev_m[is_check]))
 
 
-def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
+def between_cameras(survey: Survey, *, factor: float = 1.0) -> LocatedDistances:
     """Two taped distances between cameras, which are the true ones times a factor."""
     pairs = np.array([[0, len(survey.times) // 2], [len(survey.times) // 4, -1]])
     model = np.linalg.norm(np.diff(survey.trajectory.centers[pairs], axis=1)[:, 0], axis=1)
     metric = factor * np.linalg.norm(np.diff(survey.centers_m[pairs], axis=1)[:, 0], axis=1)
-    return LocatedDistances.between_points(metric, np.full(2, stddev_m), model)
+    return LocatedDistances.between_points(metric, np.full(2, 0.005), model)
 
 
 def between_anchors(survey: Survey, stddev_m: float = 0.005) -> AnchorDistances:

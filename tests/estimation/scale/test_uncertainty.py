@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.radio_errors import lasting
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.estimation.scale.initialize import initialize_scale
@@ -40,18 +41,14 @@ class Rigid:
         return Bending((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
 
 
-def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
+def drifting_errors(survey: Survey, seed: int) -> Array:
     """(n,) errors of each anchor that come and go over some seconds."""
-    log = survey.log
-    rng = np.random.default_rng(seed)
-    errors = np.zeros(len(log))
+    log, rng = survey.log, np.random.default_rng(seed)
+    errors_m = np.zeros(len(log))
     for k in range(len(log.anchor_ids)):
-        rows = np.flatnonzero(log.anchor_index == k)
-        keep = np.exp(-np.diff(log.timestamp_s[rows]) / memory_s)
-        errors[rows[0]] = rng.standard_normal()
-        for before, after, kept in zip(rows[:-1], rows[1:], keep, strict=True):
-            errors[after] = kept * errors[before] + np.sqrt(1 - kept**2) * rng.standard_normal()
-    return stddev * errors
+        rows = log.anchor_index == k
+        errors_m[rows] = 0.1 * lasting(log.timestamp_s[rows], 4.0, rng)
+    return errors_m
 
 
 def in_time(uncertainty: ScaleUncertainty) -> float:
@@ -76,7 +73,7 @@ def test_with_errors_that_last_the_stddev_grows_and_is_the_scatter(make_survey: 
     errors, formals, seen = [], [], []
     for seed in range(20):
         survey = make_survey(anchors_m=FAR_ANCHORS_M, num_keyframes=100, seed=seed)
-        log = survey.log_with(survey.distance_m + drifting_errors(survey, 0.1, 4.0, seed))
+        log = survey.log_with(survey.distance_m + drifting_errors(survey, seed))
         estimate = survey.scale("first_camera", "ABCD", log, range_model=WITHOUT_BIASES)
         errors.append(survey.relative_error(estimate))
         formals.append(estimate.uncertainty.formal)

@@ -54,7 +54,7 @@ def test_derivatives_by_the_sensors_numbers_are_those_of_the_sums() -> None:
         np.testing.assert_allclose(found.by_sensor[:, :, k], slope, atol=1e-6 if k < NUM_OF_SENSOR - 1 else 5e-3)
 
 
-def gtsams_sums(gtsam: Any, finer: int = 40) -> Iterator[Any]:
+def gtsams_sums(gtsam: Any) -> Iterator[Any]:
     """Yield GTSAM's sums of the intervals between the photos, with more steps than the log."""
     time_s, gyro, accel = signal()
     params = gtsam.PreintegrationParams.MakeSharedU(GRAVITY_M_S2)
@@ -64,7 +64,7 @@ def gtsams_sums(gtsam: Any, finer: int = 40) -> Iterator[Any]:
     for start, end in pairwise(PHOTO_S.tolist()):
         sums = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias())
         ends = np.array([start, *time_s[(time_s > start) & (time_s < end)], end])
-        fine = np.interp(np.arange(finer * (len(ends) - 1) + 1) / finer, np.arange(len(ends)), ends)
+        fine = np.interp(np.arange(40 * (len(ends) - 1) + 1) / 40, np.arange(len(ends)), ends)
         middle = (fine[1:] + fine[:-1]) / 2
         for at, step in zip(middle, np.diff(fine), strict=True):
             rate, force = ([np.interp(at, time_s, axis) for axis in values.T] for values in (gyro, accel))

@@ -83,9 +83,9 @@ def scaled(
     return lengths.tested(replace(IDENTITY, scale=SCALE) if others else lengths.start, others)
 
 
-def other(kind: str, longer: float = 0.0, stddev: float = 0.01) -> Observations:
+def other(kind: str, longer: float = 0.0) -> Observations:
     """Another kind of measurement, by which the map is larger than it is."""
-    one, used = np.array([[stddev**2]]), np.ones(1, dtype=bool)
+    one, used = np.array([[0.01**2]]), np.ones(1, dtype=bool)
     return Observations(
         Columns.of_whole(1),
         np.ones((1, 1)),

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
-from tests.simulated.path import loop_path
+from tests.simulated.path import along, loop_path
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.lengths.locate_lengths import locatable, locate_distances
@@ -23,7 +23,7 @@ from rangesfm.result.entries import DistanceRow
 def made() -> SyntheticModel:
     path = loop_path(30.0, start_s=0.0, seed=1)
     times = np.arange(30, dtype=np.float64)
-    return synthetic_model(times, path.centers(times), path.world_from_cam(times), pixel_stddev=0.0, seed=2)
+    return synthetic_model(*along(path, times), pixel_stddev=0.0, seed=2)
 
 
 def taped(start: str, end: str, distance_m: float = 1.0, kind: str = "check") -> TapedDistance:

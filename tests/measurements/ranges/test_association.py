@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,11 +29,10 @@ def trajectory_of(times: Array | None, centers: Array, world_from_cam: Array | N
     return Trajectory(np.arange(n), tuple(f"{i:03d}.jpg" for i in range(n)), times, centers, rotations)
 
 
-def log_at(times: npt.ArrayLike, range_m: npt.ArrayLike = 5.0, anchor_ids: Sequence[str] = ("A",)) -> RangeLog:
-    """A log of one range at each time, to the anchors in turn."""
+def log_at(times: npt.ArrayLike, range_m: npt.ArrayLike = 5.0) -> RangeLog:
+    """A log of one range at each time, all to one anchor."""
     times = np.asarray(times, dtype=np.float64)
-    ids = [anchor_ids[i % len(anchor_ids)] for i in range(len(times))]
-    return RangeLog.from_arrays(ids, np.broadcast_to(range_m, times.shape), timestamp_s=times)
+    return RangeLog.from_arrays(["A"] * len(times), np.broadcast_to(range_m, times.shape), timestamp_s=times)
 
 
 def statuses(observations: RangeObservations) -> list[str]:
@@ -242,9 +241,9 @@ class TestStopAndGo:
     PHOTOS = np.linspace(0.0, 88.0, 12)
     ANCHOR = np.array([6.0, 5.0, 2.0])
 
-    def log(self, position_at: Callable[[Array], Array], times: Array, stddev: float = 0.05) -> RangeLog:
+    def log(self, position_at: Callable[[Array], Array], times: Array) -> RangeLog:
         ranges = np.linalg.norm(position_at(times) - self.ANCHOR, axis=1)
-        return log_at(times, ranges + stddev * np.random.default_rng(0).standard_normal(len(times)))
+        return log_at(times, ranges + 0.05 * np.random.default_rng(0).standard_normal(len(times)))
 
     def test_bursts_around_photos_taken_standing_still_belong_to_the_photos(self) -> None:
         times = (self.PHOTOS[:, None] + np.linspace(-1.0, 1.0, 20)).ravel()

@@ -42,9 +42,7 @@ class Browser:
         service = selenium.ChromeService(executable_path=driver)
         self._driver = selenium.Chrome(options=options, service=service)
 
-    def open(
-        self, page: Path, *, width: int = 1280, height: int = 900, theme: str = "light", is_unfolded: bool = True
-    ) -> None:
+    def open(self, page: Path, *, width: int = 1280, theme: str = "light", is_unfolded: bool = True) -> None:
         """Open a page from disk in a window of this size, wait for its figures and view, and forget earlier logs.
 
         Args:
@@ -52,7 +50,7 @@ class Browser:
         """
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.command("Emulation.setEmulatedMedia", features=features)
-        self._set_size(width, height)
+        self.resize(width)
         for kind in ("browser", "performance"):
             self._driver.get_log(kind)
         self._driver.get(page.as_uri())
@@ -63,9 +61,6 @@ class Browser:
 
     def resize(self, width: int, height: int = 900) -> None:
         """Give the window another size, without opening the page again."""
-        self._set_size(width, height)
-
-    def _set_size(self, width: int, height: int) -> None:
         is_phone = width < 600
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone}
         self.command("Emulation.setDeviceMetricsOverride", **metrics)

@@ -31,7 +31,6 @@ def write_video(
     *,
     created: str | None = None,
     matrix: Sequence[int] | None = None,
-    crf: int = 16,
 ) -> Path:
     """Write an H.264 video with a frame at each time, counted from the first one."""
     with av.open(path, "w") as video:
@@ -40,7 +39,7 @@ def write_video(
         stream = None
         for image, time_s in zip(images, times_s, strict=True):
             if stream is None:
-                stream = video.add_stream("libx264", rate=30, options={"crf": str(crf)})
+                stream = video.add_stream("libx264", rate=30, options={"crf": "16"})
                 stream.width, stream.height, stream.pix_fmt = *image.size, "yuv420p"
                 stream.time_base = stream.codec_context.time_base = _TIME_BASE
                 stream.set_display_matrix(matrix)

@@ -30,9 +30,9 @@ def flight(num: int = 100) -> Array:
     return loop_path(60.0, height_amplitude_m=1.5, seed=1).centers(np.linspace(0.0, 60.0, num))
 
 
-def flat(num: int = 100) -> Array:
-    """(n, 3) positions on the same loop at a constant height of 1 m."""
-    return flight(num) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+def flat() -> Array:
+    """(100, 3) positions on the same loop at a constant height of 1 m."""
+    return flight() * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
 
 
 def distances(positions: Array, anchor: Array = ANCHOR_M) -> Array:

@@ -142,9 +142,9 @@ def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: Rang
     assert ratio[1] > 5 * ratio[0]
 
 
-def two_causes(num: int = 12) -> ComponentLikelihood:
+def two_causes() -> ComponentLikelihood:
     """Noise and a common error, with two unknowns of which one has a prior."""
-    rng = np.random.default_rng(7)
+    rng, num = np.random.default_rng(7), 12
     return ComponentLikelihood(
         of_components=np.stack([np.eye(num), np.ones((num, num))]),
         log_medians=np.log([0.05, 0.1]),

@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 NUM_EACH = 400
 
 
-def make_errors(stddev_m: float = 1.0, *, is_estimated: bool = True, loss: RobustLoss = GEMAN_MCCLURE) -> RangeErrors:
+def make_errors(stddev_m: float = 1.0, *, loss: RobustLoss = GEMAN_MCCLURE) -> RangeErrors:
     """Errors of three anchors in turn, for 400 rounds of half a second."""
     n = 3 * NUM_EACH
     rounds = np.arange(n) // 3
@@ -23,7 +23,7 @@ def make_errors(stddev_m: float = 1.0, *, is_estimated: bool = True, loss: Robus
         stddev_m=np.full(n, stddev_m),
         share=np.ones(n),
         inflation=1.0,
-        given_m=np.full(n, np.nan if is_estimated else stddev_m),
+        given_m=np.full(n, np.nan),
         shared_m=np.zeros(n),
         placing_m=np.zeros(n),
         anchor_index=np.arange(n) % 3,

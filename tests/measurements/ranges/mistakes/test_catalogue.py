@@ -14,10 +14,10 @@ from rangesfm.measurements.ranges.mistakes.linearized import Linearized, lineari
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 
 
-def placed_exactly(heights_m: tuple[float, ...] = (2.0, 1.5, 3.0)) -> RangesOnMap:
+def placed_exactly() -> RangesOnMap:
     """Return ranges to anchors whose coordinates are exact, so that a wrong one shows in the ranges alone."""
     on_map = small_map((0.0, 0.0, 0.0), num_tags=2)
-    means_m = np.column_stack([ANCHORS_M[:, :2], heights_m])
+    means_m = np.column_stack([ANCHORS_M[:, :2], (2.0, 1.5, 3.0)])
     return on_map.with_problem(replace(on_map.problem, anchor_mean_m=means_m))
 
 

@@ -33,7 +33,6 @@ def small_map(
     stddevs_m: Sequence[float] = (0.0, 0.1, np.inf),
     *,
     num_tags: int = 1,
-    has_times: bool = True,
     frame_is_free: bool = True,
     arms_m: Sequence[Sequence[float]] = (ARM_M, (0.3, 0.1, -0.1)),
 ) -> RangesOnMap:
@@ -90,7 +89,7 @@ def small_map(
             ranges=problem,
             model_from_path=IDENTITY,
             model_from_cam=model_from_cam,
-            velocity=velocity if has_times else None,
+            velocity=velocity,
             rows=np.arange(num),
             notes=(),
             left_out=(),
@@ -104,10 +103,10 @@ def small_map(
     )
 
 
-def slopes(function: Callable[[Array], Array], num: int, step: float = 1e-6) -> Array:
+def slopes(function: Callable[[Array], Array], num: int) -> Array:
     """Return the derivatives at zero of a function of ``num`` numbers, which are the last axis."""
-    steps = step * np.eye(num)
-    return np.stack([(function(each) - function(-each)) / (2 * step) for each in steps], axis=-1)
+    steps = 1e-6 * np.eye(num)
+    return np.stack([(function(each) - function(-each)) / 2e-6 for each in steps], axis=-1)
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,11 @@ NOISE_M = 0.05
 Values = npt.NDArray[np.float64]
 
 
-def ranges_at(times_s: Values, anchor: int, *, speed: float = 0.6, noise_m: float = NOISE_M, seed: int = 1) -> Values:
+def ranges_at(times_s: Values, anchor: int, *, speed: float = 0.6, noise_m: float = NOISE_M) -> Values:
     """Ranges to one anchor on a circle of 2 m."""
     turns = speed * times_s / 2
     tag_m = 2 * np.column_stack([np.cos(turns), np.sin(turns)])
-    noise = np.random.default_rng([seed, anchor]).normal(0, noise_m, len(times_s))
+    noise = np.random.default_rng([1, anchor]).normal(0, noise_m, len(times_s))
     return np.asarray(np.linalg.norm(tag_m - ANCHORS_M[anchor], axis=1) + noise)
 
 

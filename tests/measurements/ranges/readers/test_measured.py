@@ -16,12 +16,12 @@ TIMES_S = 0.05 * np.arange(400)
 RANGES_M = np.round(6 + 3 * np.sin(TIMES_S / 3 + np.arange(400) % 4) + np.random.default_rng(4).normal(0, 0.04, 400), 3)
 
 
-def log_with(path: Path, wrong: Iterable[float], *, unit: str = "m", seed: int = 1) -> Path:
+def log_with(path: Path, wrong: Iterable[float], *, unit: str = "m") -> Path:
     """Write ranges to four anchors, in which ``wrong`` numbers, in the unit of the file, replace some."""
     per_metre = {"m": 1, "cm": 100, "mm": 1000}[unit]
     numbers = RANGES_M * per_metre if unit == "m" else np.round(RANGES_M * per_metre)
     wrong = list(wrong)
-    numbers[np.random.default_rng(seed).choice(400, len(wrong), replace=False)] = wrong
+    numbers[np.random.default_rng(1).choice(400, len(wrong), replace=False)] = wrong
     rows = (f"{time:.3f},A{k % 4},{number:.10g}" for k, (time, number) in enumerate(zip(TIMES_S, numbers)))
     path.write_text("\n".join([f"time_s,anchor_id,range_{unit}", *rows]) + "\n")
     return path

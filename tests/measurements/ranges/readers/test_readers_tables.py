@@ -44,9 +44,9 @@ def lines(header: str | None, row: Callable[[float, str, float], str], rows: lis
     return "\n".join([*([] if header is None else [header]), *(row(*one) for one in rows or ROWS)]) + "\n"
 
 
-def wide(header: str | None, begin: Callable[[float], str], cell: str = "{:.3f}", separator: str = ",") -> str:
+def wide(header: str | None, begin: Callable[[float], str], separator: str = ",") -> str:
     rounds = [ROWS[k : k + 4] for k in range(0, len(ROWS), 4)]
-    body = [separator.join([begin(one[0][0]), *(cell.format(r) for *_, r in one)]) for one in rounds]
+    body = [separator.join([begin(one[0][0]), *(f"{r:.3f}" for *_, r in one)]) for one in rounds]
     return "\n".join([*([] if header is None else [header]), *body]) + "\n"
 
 
@@ -61,9 +61,9 @@ def clock(seconds: float) -> str:
     return f"{int(seconds // 3600) % 24:02d}:{int(seconds // 60) % 60:02d}:{seconds % 60:06.3f}"
 
 
-def check_times(log: RangeLog, rows: list[Row] = ROWS, tolerance_s: float = 1.1e-3) -> None:
+def check_times(log: RangeLog, rows: list[Row] = ROWS) -> None:
     found = log.timestamp_s - log.timestamp_s[0]
-    np.testing.assert_allclose(found, np.array([time_s for time_s, *_ in rows]) - rows[0][0], atol=tolerance_s)
+    np.testing.assert_allclose(found, np.array([time_s for time_s, *_ in rows]) - rows[0][0], atol=1.1e-3)
 
 
 PLAIN = lines("time,anchor,range", lambda t, a, r: f"{t:.3f},{a},{r:.3f}")

@@ -61,9 +61,9 @@ def random_problem(rng: np.random.Generator, state: RangeState) -> RangeProblem:
     return replace(problem, range_m=predicted_ranges(problem, state))
 
 
-def finite_differences(function: Callable[[Array], Array], at: Array, step: float = 1e-6) -> Array:
-    steps = step * np.eye(len(at))
-    return np.stack([(function(at + s) - function(at - s)) / (2 * step) for s in steps], axis=1)
+def finite_differences(function: Callable[[Array], Array], at: Array) -> Array:
+    steps = 1e-6 * np.eye(len(at))
+    return np.stack([(function(at + s) - function(at - s)) / 2e-6 for s in steps], axis=1)
 
 
 def test_prediction_is_the_hand_computed_one() -> None:
