@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.estimation.photo_bending import HELD, LARGEST_FACTOR, PhotoBending
 from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.solver.bending import NO_STEPS, FrameSteps
-from rangesfm.solver.linear_map import Columns, regular
+from rangesfm.solver.linear_map import Columns
 from rangesfm.solver.normal_equations import HALF_A_REVOLUTION
 from rangesfm.solver.part_errors import PartSteps, map_errors, rows_of, steps_of
 from rangesfm.solver.posterior import JointProblem
@@ -78,14 +78,13 @@ def sizes_of_parts(on_map: JointMap) -> tuple[SizeOfPart, ...]:
     parts = [part for part in bending.parts[1:] if np.count_nonzero(part) > 1]
     if not parts:
         return ()
-    linear, noise = problem.among(problem.is_used)
     by_pose = np.vstack([*map(bending.size_beside, parts), on_map.by_pose])
     gradients = bending.shape_by_steps(by_pose, frame_is_free=known.columns.frame >= 0)
     factor = _factor(problem)
     own, observed = gradients[:, : len(parts)], gradients[:, len(parts) :]
     moved = factor**2 * bending.photos_at(factor).solve(own)
     across = moved.T @ observed
-    whitened = np.linalg.solve(regular(noise.covariance_m2), np.hstack([across.T, linear.design]))
+    whitened = cho_solve((problem.solution.lower, True), np.hstack([across.T, problem.design[problem.is_used]]))
     left = across @ whitened[:, len(parts) :]
     covariance = moved.T @ own - across @ whitened[:, : len(parts)] + left @ known.covariance @ left.T
     # A refined map is where all that is measured has it; a scaled one is as the photos alone have it.
@@ -126,7 +125,6 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
     if not isinstance(bending, PhotoBending):
         return UNKNOWN_ERRORS
     columns, photos, variance = known.columns, bending.photos_at(_factor(problem)), _factor(problem) ** 2
-    linear, noise = problem.among(problem.is_used)
     column_of = dict(zip(anchor_ids, columns.anchor.tolist(), strict=False))
     heard = [name for what, name in rest.blocks if what == "anchor" and name in column_of]
     parts = [
@@ -165,9 +163,9 @@ def errors_at_estimate(at_rest: JointMap, rest: MapAtRest, anchor_ids: Sequence[
         return np.asarray(own - observed.T @ (observed @ right) + left @ (covariance @ (left.T @ right)))
 
     across = bent(bending.shape_by_steps(at_rest.by_pose, frame_is_free=is_free))
-    lower = np.linalg.cholesky(regular(noise.covariance_m2))
+    lower = problem.solution.lower
     observed = solve_triangular(lower, across.T, lower=True)
-    left = by_unknown - observed.T @ solve_triangular(lower, linear.design, lower=True)
+    left = by_unknown - observed.T @ solve_triangular(lower, problem.design[problem.is_used], lower=True)
     covariance = _turns_bounded(known.covariance, columns)
     scale = columns.scale
     return map_errors(

@@ -13,12 +13,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_solve
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.solver.bending import BENDS, Bending, MapBending
-from rangesfm.solver.linear_map import Columns, LinearMap, Solved, regular
+from rangesfm.solver.linear_map import Columns, LinearMap, Solved
 from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 
@@ -270,7 +270,7 @@ class JointProblem(LinearMap):
         """
         used, rows, noise_m2 = self.is_used, self.rows[kind], self.noise.covariance_m2
         across = noise_m2[rows][:, used]
-        factor = cho_factor(regular(noise_m2[np.ix_(used, used)]))
+        factor = self.solution.lower, True
         left = self.design[rows] - across @ cho_solve(factor, self.design[used])
         return np.asarray(noise_m2[rows, rows] - across @ cho_solve(factor, across.T) + left @ covariance @ left.T)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
@@ -15,7 +15,6 @@ from rangesfm.measurements.ranges.mistakes.linearized import Linearized, is_near
 from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.solver.bending import BENDS, WalkBending
-from rangesfm.solver.linear_map import regular
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rmse
 
@@ -91,7 +90,7 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     moved, stddevs_m = problem.after_step(), problem.noise.stddev_of_component
-    pulls = cho_solve(cho_factor(regular(problem.noise.covariance_m2)), moved.residual_m)
+    pulls = cho_solve((problem.solution.lower, True), moved.residual_m)
     by_pose = problem.bins.by_pose(on_map.by_poses, len(walk.path))
     sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.components if part.name in BENDS}
     bent = walk.bent_back(pulls @ by_pose, sizes, frame_is_free=is_free)
