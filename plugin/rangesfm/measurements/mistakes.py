@@ -47,14 +47,6 @@ class Correction:
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
-def _unsaid(_: Array) -> str:
-    return ""
-
-
-def _uncorrected(_: Array) -> Correction:
-    return Correction()
-
-
 @dataclass(frozen=True)
 class Mistake:
     """A possible mistake that k numbers describe; none, if it has no size and is tried as a whole.
@@ -81,9 +73,9 @@ class Mistake:
 
     name: str
     columns: Array
-    words: Callable[[Array], str] = _unsaid
+    words: Callable[[Array], str] = lambda _: ""
     remedy: str = ""
-    correction: Callable[[Array], Correction] = _uncorrected
+    correction: Callable[[Array], Correction] = lambda _: Correction()
     most: float = np.inf
     subject: str = ""
     unit: str = "m"
