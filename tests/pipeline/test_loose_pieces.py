@@ -100,3 +100,18 @@ def test_a_photo_of_one_point_may_be_anywhere_and_the_rest_of_the_map_is_as_cert
     if anchors:
         for name in ("stddev_m", "heading_stddev_deg"):
             assert after["place"][name] == pytest.approx(before["place"][name], rel=0.1)
+
+
+def test_photos_that_share_no_point_are_left_out_with_a_word(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    folder = own_survey.folder / "sparse" / "0"
+    model, apart = pycolmap.Reconstruction(folder), own_survey.image_names[20]
+    leave_across(model, {apart}, 0)
+    model.write(folder)
+    flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
+    said = rangesfm_command("refine", *flags, cwd=own_survey.folder)
+    assert f"1 of 40 photos of the model share no point with another, the first is {apart}: nothing tells" in said.stderr
+    written = pycolmap.Reconstruction(own_survey.folder / "out" / "sparse_metric" / "0")
+    placed = {image.name for image in written.images.values() if image.has_pose}
+    assert placed == {*own_survey.image_names} - {apart}

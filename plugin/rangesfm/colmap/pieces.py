@@ -32,7 +32,7 @@ def ids_seen_in(image: pycolmap.Image) -> Indices:
 
 def overlaps_in(model: pycolmap.Reconstruction) -> csr_array:
     """Return the sparse matrix (n, n) of the numbers of points that pairs of the n registered photos both see."""
-    sees = _sees(model, np.arange(model.num_reg_images()))
+    sees = _sees(model, np.arange(model.num_reg_images()), model.num_reg_images())
     return csr_array(sees @ sees.T)
 
 
@@ -82,14 +82,31 @@ def frames_of_parts(model: pycolmap.Reconstruction) -> tuple[Indices, ...]:
     return tuple(sorted(parts, key=len, reverse=True))
 
 
+def photos_without_shared_points(model: pycolmap.Reconstruction) -> tuple[str, ...]:
+    """Return the names of the photos of frames that share no point with any other, so that nothing tells their places.
+
+    None of a model without shared points, which is a trajectory.
+    """
+    frame_ids, sees = _seen_by_frames(model)
+    sees.data[:] = 1.0
+    is_shared = sees.sum(axis=0) > 1
+    is_apart = sees[:, is_shared].sum(axis=1) == 0
+    return tuple(sorted(_names_in(model, frame_ids[is_apart]))) if is_shared.any() else ()
+
+
+def _seen_by_frames(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array]:
+    """Return the ids (f,) of the frames, and the matrix (f, p) of the points that they see."""
+    frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
+    frame_of = [model.image(image_id).frame_id for image_id in model.reg_image_ids()]
+    return frame_ids, _sees(model, np.searchsorted(frame_ids, frame_of), len(frame_ids))
+
+
 def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]:
     """Return the ids (f,) of the frames, the matrix (f, p) of the points that they see, and the part (f,) of each.
 
     Parts are merged as long as two of them share enough points. A model without points is one part.
     """
-    frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
-    frame_of = [model.image(image_id).frame_id for image_id in model.reg_image_ids()]
-    sees = _sees(model, np.searchsorted(frame_ids, frame_of))
+    frame_ids, sees = _seen_by_frames(model)
     if not sees.shape[1]:
         return frame_ids, sees, np.zeros(len(frame_ids), dtype=np.int64)
     labels = np.arange(len(frame_ids))
@@ -104,7 +121,7 @@ def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]
             return frame_ids, sees, labels
 
 
-def _sees(model: pycolmap.Reconstruction, row_of_photo: Indices) -> csr_array:
+def _sees(model: pycolmap.Reconstruction, row_of_photo: Indices, num_rows: int) -> csr_array:
     """Return the sparse matrix (k, p) of how often each row sees each of p points.
 
     Args:
@@ -113,7 +130,6 @@ def _sees(model: pycolmap.Reconstruction, row_of_photo: Indices) -> csr_array:
     photos = [ids_seen_in(model.image(image_id)) for image_id in model.reg_image_ids()]
     row = np.repeat(row_of_photo, [*map(len, photos)])
     unique, column = np.unique(np.concatenate([*photos, np.zeros(0, dtype=np.int64)]), return_inverse=True)
-    num_rows = int(row_of_photo.max(initial=-1)) + 1
     return coo_array((np.ones(len(row)), (row, column)), shape=(num_rows, len(unique))).tocsr()
 
 

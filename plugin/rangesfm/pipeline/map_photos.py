@@ -13,7 +13,9 @@ import pycolmap
 
 from rangesfm.colmap.model_files import model_of_trajectory, read_model
 from rangesfm.colmap.passthrough import apply_options
+from rangesfm.colmap.pieces import photos_without_shared_points
 from rangesfm.colmap.reprojection import wrong_axes
+from rangesfm.colmap.transform import without_photos
 from rangesfm.diagnostics.preflight import (
     notes_before_work,
     notes_on_gaps,
@@ -140,6 +142,8 @@ def with_times(run: SurveyRun, times: ImageTimes) -> SurveyRun:
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     """Read a given COLMAP model, or a trajectory as one, and warn of what is wrong with it.
 
+    Photos that share no point with others are left out, unless the model is a trajectory.
+
     Raises:
         InputError: it cannot be read, has no registered images, or its axes are not as in COLMAP.
     """
@@ -149,7 +153,12 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     if (said := wrong_axes(model)) is not None:
         raise InputError(said, path)
     journal.warn(*notes_on_model(model))
-    return model
+    if apart := photos_without_shared_points(model):
+        journal.warn(
+            f"{len(apart)} of {model.num_reg_images()} photos of the model share no point with another, the first is "
+            f"{apart[0]}: nothing tells where they are, so they are left out (of poses without any points, none are)"
+        )
+    return without_photos(model, apart)
 
 
 def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = False) -> Survey:
