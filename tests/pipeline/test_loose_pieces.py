@@ -111,7 +111,9 @@ def test_photos_that_share_no_point_are_left_out_with_a_word(
     model.write(folder)
     flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
     said = rangesfm_command("refine", *flags, cwd=own_survey.folder)
-    assert f"1 of 40 photos of the model share no point with another, the first is {apart}: nothing tells" in said.stderr
+    assert (
+        f"1 of 40 photos of the model share no point with another, the first is {apart}: nothing tells" in said.stderr
+    )
     written = pycolmap.Reconstruction(own_survey.folder / "out" / "sparse_metric" / "0")
     placed = {image.name for image in written.images.values() if image.has_pose}
     assert placed == {*own_survey.image_names} - {apart}

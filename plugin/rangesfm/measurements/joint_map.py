@@ -25,7 +25,7 @@ from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
-from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
+from rangesfm.util.geometry.numerics import FOOT_M, MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 
 
+# Units in which numbers are given for metres, and what one metre is in them.
+_UNITS_PER_METRE = {"feet": 1 / FOOT_M, "inches": 12 / FOOT_M, "centimetres": 100.0, "millimetres": 1000.0}
 # Number of measurements for which it is tried what the others say without them, the most deviating first.
 _NUM_SUSPECTS = 3
 
@@ -56,6 +58,9 @@ class KindOnMap(Located):
 
     shows_bending: ClassVar[bool] = False
     """Whether there are so many of them that they show by how much a map is bent."""
+
+    may_be_in_other_unit: ClassVar[bool] = True
+    """Whether a file may have them in another unit without a sign of it in their fit."""
 
     notes: tuple[str, ...] = ()
     """What is said of them whatever becomes of the map, in words."""
@@ -319,17 +324,21 @@ class JointMap:
 
 
 def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second: ScaleByKind) -> MistakeTest:
-    """Return the test that compares the scales from two kinds of measurement."""
+    """Return the test that compares the scales from two kinds of measurement, in metres per unit of the model."""
     apart = float(np.log(first.value / second.value))
     stddev = float(np.hypot(first.stddev / first.value, second.stddev / second.value))
     smallest = float(np.sqrt(noncentrality(1))) * stddev
+    large, small = (kind, other) if apart > 0 else (other, kind)
+    by_large, by_small = max(first.value, second.value), min(first.value, second.value)
+    unit = _unit_that_explains(large, small, abs(apart), stddev)
     return MistakeTest(
         f"{kind.kind} against {other.kind}",
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
         float(special.chdtri(1, FALSE_ALARM_RATE)),
-        words=f"by the {kind.words} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the {other.words}; "
-        f"their errors together explain {100 * stddev:.1f} % (1 stddev)",
+        words=f"by the {large.words} the map is {100 * (by_large / by_small - 1):.1f} % larger than by the "
+        f"{small.words} ({by_large:.4g} and {by_small:.4g} m per unit of the model); their errors together explain "
+        f"{100 * stddev:.1f} % (1 stddev){unit}",
         remedy=f"{kind.remedy}, and {other.remedy}",
         unit="1",
         size=apart,
@@ -337,6 +346,20 @@ def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second:
         smallest_detectable=smallest,
         effect_on_scale=smallest,
     )
+
+
+def _unit_that_explains(large: KindOnMap, small: KindOnMap, apart: float, stddev: float) -> str:
+    """Return in which unit the numbers of one kind are, if that explains by how much two kinds differ; else nothing.
+
+    Args:
+        large, small: those with the larger and the smaller scale. apart: logarithm of the ratio. stddev: of that.
+    """
+    for unit, per_metre in _UNITS_PER_METRE.items():
+        if abs(apart - np.log(per_metre)) < SIGNIFICANT_STDDEVS * stddev < np.log(per_metre):
+            said = f"the {large.words} in {unit}" * large.may_be_in_other_unit
+            converted = f"the {small.words} in metres that were taken for {unit}" * small.may_be_in_other_unit
+            return f", and {' or '.join(filter(None, (said, converted)))} would explain it"
+    return ""
 
 
 def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:

@@ -73,6 +73,7 @@ class InertialScale(KindOnMap):
 
     kind, words = IMU, IMU_WORDS.words
     remedy = "measure a length, and look at what the notes say of the sensor's alignment"
+    may_be_in_other_unit = False  # gravity shows it
 
     @property
     def start(self) -> Similarity:

@@ -138,7 +138,8 @@ class LengthScale(KindOnMap):
         open_words = [row.words for row, is_kept in zip(rows, self.is_kept, strict=True) if is_kept and row.rejected]
         either = [f"either {'; or '.join(open_words)}: {_MEASURE_AGAIN}"] if open_words else []
         against = self.against_others(on_map, by_kind)
-        reasons = (*left_out, *either, *(f"{row.words}: {row.remedy}" for row in against if row.rejected))
+        # Where all of them are in another unit, each seems to be mistyped.
+        reasons = (*left_out, *(f"{row.words}: {row.remedy}" for row in against if row.rejected), *either)
         # Printed tags are shown only if something was found: their sides are many and alike.
         told = [row for row, one in zip(rows, self.taped, strict=True) if row.rejected or not one.is_printed]
         told.sort(key=lambda row: row.threshold - row.statistic)

@@ -16,7 +16,6 @@ from rangesfm.measurements.ranges.mistakes.effects import (
     where_ranges_meet,
 )
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
-from rangesfm.measurements.ranges.readers.units import FOOT_M
 from rangesfm.measurements.ranges.scale.range_equation import (
     RangeFit,
     RangeProblem,
@@ -26,6 +25,7 @@ from rangesfm.measurements.ranges.scale.range_equation import (
 )
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
+from rangesfm.util.geometry.numerics import FOOT_M
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
 

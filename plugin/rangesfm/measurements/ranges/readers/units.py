@@ -14,8 +14,8 @@ from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT, unit_by
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
 from rangesfm.measurements.ranges.readers.vocabulary import TIMES, named_length_unit, named_unit, words_of
 from rangesfm.util.files.clock_times import are_seconds_since_1970
+from rangesfm.util.geometry.numerics import FOOT_M
 
-FOOT_M = 0.3048
 UNITS_PER_METRE = {
     "m": 1.0,
     "cm": 100.0,
