@@ -332,7 +332,7 @@ class PositionOptions(_OptionsOfLog, table="positions"):
     of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors; or the folder of photos, for
     those in their EXIF data."""
     format: Annotated[str, Key(flag="positions_format")] = ""
-    """Format of the file: table, tum, nmea, rtklib, gpx, odm, marvelmind or colmap (default: recognised by content)."""
+    """Format of the file: table, tum, nmea, rtklib, gpx, odm, dwm1001, marvelmind or colmap (default: by content)."""
     columns: Annotated[dict[str, str], Key(flag="position_columns")] = Field(default_factory=dict)
     """Names of the columns of a table (numbers, where they have no names) for timestamp or image_name, x, y, z, and
     possibly stddev (or stddev_x, stddev_y, stddev_z) and tag_id (default: recognised)."""

@@ -67,7 +67,10 @@ class TestListImages:
 
     def test_says_that_a_folder_has_no_photos(self, tmp_path: Path) -> None:
         (tmp_path / "a.txt").touch()
-        with pytest.raises(InputError, match=r"no photos \(jpg jpeg png tif tiff bmp webp\) in this folder"):
+        with pytest.raises(InputError, match=r"no photos \(jpg jpeg png tif tiff bmp webp\) in this folder$"):
+            list_images(tmp_path)
+        (tmp_path / "IMG_7.HEIC").touch()
+        with pytest.raises(InputError, match=r"in this folder; convert IMG_7.HEIC and its like to JPEG$"):
             list_images(tmp_path)
 
 
@@ -171,6 +174,13 @@ class TestExif:
             "2 of 5 photos have no time and are left out, the first is d.jpg",
             "1 of 5 photos have the same time as another and are left out, the first is b.jpg",
         )
+
+    def test_names_the_file_of_a_rig_where_photos_of_several_folders_have_one_time(self, tmp_path: Path) -> None:
+        names = [f"{camera}/{k}.jpg" for camera in ("left", "right") for k in range(2)]
+        for name in names:
+            write_photo(tmp_path / name, f"2026:01:01 00:00:0{name[-5]}")
+        (note,) = find_image_times(tmp_path, names).notes[:1]
+        assert note.endswith("are left out, the first is right/0.jpg (cameras of a rig need --rig_config_path)")
 
 
 class TestFileNames:

@@ -52,6 +52,12 @@ def test_a_photo_that_claims_more_pixels_than_can_be_used_is_left_out_with_the_r
     assert image_size(folder / "c.png") is None
 
 
+def test_a_photo_of_a_phone_that_is_not_what_its_name_says_is_left_out_with_the_reason(folder: Path) -> None:
+    (folder / "IMG_7.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(200))
+    photos = usable_photos(folder, ["a.png", "b.png", "IMG_7.jpg"])
+    assert photos.left_out == {"IMG_7.jpg": "is a HEIC photo, whatever its name says: convert it to JPEG"}
+
+
 def test_a_photo_that_is_a_fifo_is_left_out_and_waited_for_by_nobody(folder: Path) -> None:
     os.mkfifo(folder / "c.png")
     photos = usable_photos(folder, ["a.png", "b.png", "c.png"])

@@ -21,7 +21,7 @@ from rangesfm.sfm.photo_list import read_photo_list
 from rangesfm.util.files.atomic import is_plain_name
 from rangesfm.util.files.clock_times import are_seconds_since_1970
 from rangesfm.util.files.contents import AnyPath
-from rangesfm.util.files.folders import IMAGE_EXTENSIONS, natural_order, walk
+from rangesfm.util.files.folders import IMAGE_EXTENSIONS, OTHER_PHOTOS, natural_order, walk
 from rangesfm.util.files.photo_names import photos_meant
 from rangesfm.util.files.text_tables import NO_NAMES, TextTable
 
@@ -88,7 +88,9 @@ def list_images(folder: AnyPath) -> tuple[str, ...]:
         if name.lower().endswith(IMAGE_EXTENSIONS)
     ]
     if not names:
-        raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder", folder)
+        others = [name for _, _, files in walk(folder) for name in files if name.lower().endswith(OTHER_PHOTOS)]
+        there = f"; convert {others[0]} and its like to JPEG" if others else ""
+        raise InputError(f"no photos ({' '.join(e[1:] for e in IMAGE_EXTENSIONS)}) in this folder{there}", folder)
     for name in names:
         if not is_plain_name(name):
             raise InputError(f"the name of the photo '{name}' is not printable UTF-8 text: rename it", folder)
@@ -229,9 +231,10 @@ def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: s
     if missing := [name for name in names if name not in stamps]:
         notes.append(f"{len(missing)} of {len(names)} photos have no time and are left out, the first is {missing[0]}")
     if repeated := sorted(set(ordered) - set(kept)):
+        is_of_one = len({os.path.dirname(name) for name in ordered}) == 1
         notes.append(
             f"{len(repeated)} of {len(names)} photos have the same time as another and are left out, "
-            f"the first is {repeated[0]}"
+            f"the first is {repeated[0]}{'' if is_of_one else ' (cameras of a rig need --rig_config_path)'}"
         )
     if resolution_s >= 1.0:
         notes.append("image times are whole seconds: at walking pace that is up to half a metre of path")

@@ -187,6 +187,40 @@ def test_latitude_before_longitude_is_offered_in_a_list_without_names(tmp_path: 
     assert "image_name=1,x=3,y=2,z=4" in [choice.flags["position_columns"] for choice in error.value.choices]
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "POS,{:.2f},-2.85,0.59,74",
+        "DIST,1,AN0,022E,7.94,8.03,0.00,3.44,POS,{:.2f},-2.85,0.59,74",
+        "022E[7.94,8.03,0.00]=3.38 le_us=3082 est[{:.2f},-2.85,0.59,74]",
+    ],
+)
+def test_positions_that_a_dwm1001_prints_are_read_with_the_hosts_time(line: str, tmp_path: Path) -> None:
+    found = read(tmp_path, "dwm> lep\n" + "".join(f"{1.7e9 + k:.3f} {line.format(k)}\n" for k in range(5)))
+    assert found.format == "dwm1001"
+    np.testing.assert_array_equal(found.moments.timestamp_s, 1.7e9 + np.arange(5))
+    np.testing.assert_array_equal(found.position_m[3], [3.0, -2.85, 0.59])
+    with pytest.raises(InputError, match=r"positions.txt:1: no time before the position"):
+        read(tmp_path, line.format(1) + "\n")
+
+
+def test_coordinates_in_whole_numbers_are_asked_about(tmp_path: Path) -> None:
+    rows = "".join(
+        f'[{{"timestamp": {1.7e9 + k}, "coordinates": {{"x": {1000 + 20 * k}, "y": {7 * k}, "z": 1300}}}}]\n'
+        for k in range(30)
+    )
+    with pytest.raises(UnclearFileError, match="not known for sure") as error:
+        read(tmp_path, rows)
+    assert [choice.flags["position_unit"] for choice in error.value.choices] == ["mm", "cm", "m"]
+    np.testing.assert_allclose(read(tmp_path, rows, unit="mm").position_m[1], [1.02, 0.007, 1.3])
+
+
+def test_a_time_before_the_topic_of_a_message_is_its_time(tmp_path: Path) -> None:
+    row = '{:.3f} dwm/node/0c96/uplink/location {{"position":{{"x":1.25,"y":{},"z":3.5,"quality":68}}}}\n'
+    found = read(tmp_path, "".join(row.format(1.7e9 + k, 0.5 + k) for k in range(30)))
+    np.testing.assert_array_equal(found.moments.timestamp_s, 1.7e9 + np.arange(30))
+
+
 def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{1700000000000 + 100 * k},100,{100 * k},5,1.0{k},2.0,0.5,1,3.2,2,4.1\n" for k in range(3))
     found = read(tmp_path, rows)

@@ -127,6 +127,13 @@ def test_a_track_of_a_phone_is_positions(tmp_path: Path) -> None:
     assert paths(look_into([tmp_path])) == {"positions.path": ["walk.gpx"]}
 
 
+def test_positions_of_a_radio_are_positions_unless_ranges_are_beside_them(tmp_path: Path) -> None:
+    position = "POS,4.07,-2.85,0.59,74\n"
+    (tmp_path / "lep.log").write_text("".join(f"{1.7e9 + k:.3f} {position}" for k in range(30)))
+    (tmp_path / "lec.log").write_text(f"{1.7e9:.3f} DIST,1,AN0,022E,7.94,8.03,0.00,3.44,{position}")
+    assert paths(look_into([tmp_path])) == {"positions.path": ["lep.log"], "ranges.path": ["lec.log"]}
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [

@@ -1,4 +1,4 @@
-"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, GPX, ODM, Marvelmind's dashboard, COLMAP's databases.
+"""Readers of positions: tables of any layout, and the formats of POSITION_READERS.
 
 Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
 write tables with names of columns, which are recognised like those of range logs.
@@ -26,9 +26,10 @@ from rangesfm.measurements.positions.position_columns import (
 from rangesfm.measurements.positions.position_log import PositionLog, crs_in_head, crs_of_line, is_no_row
 from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
 from rangesfm.measurements.ranges.readers import vocabulary as terms
-from rangesfm.measurements.ranges.readers.layout import MISSING
-from rangesfm.measurements.ranges.readers.lists import AXES, metres, times_by_row
-from rangesfm.measurements.ranges.readers.times import DAY_S
+from rangesfm.measurements.ranges.readers.layout import MISSING, find_layout
+from rangesfm.measurements.ranges.readers.lists import AXES, metres, times_by_row, unclear_table
+from rangesfm.measurements.ranges.readers.readings import RECORD_TIMES
+from rangesfm.measurements.ranges.readers.times import DAY_S, Clock
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, PositionOptions
 from rangesfm.util.files.text_tables import (
@@ -53,6 +54,10 @@ _NMEA_STDDEVS_M = {1: AUTONOMOUS_STDDEV_M, 2: 1.0, 4: 0.02, 5: 0.3}
 _NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?\s*")
 
 _GPX_POINT = "<trkpt"  # of a track
+_DECIMALS = r"-?\d{1,6}\.\d\d"
+_DWM1001 = re.compile(rf"(?:POS,|(?:POS|est)\[)({_DECIMALS}),({_DECIMALS}),({_DECIMALS}),\d{{1,3}}(?![\d.])", re.ASCII)
+_DWM1001_BEGIN = re.compile(r"POS[,\[]|DIST,|AN\d|[0-9A-F]{4}\[", re.ASCII)  # the host's time is in front of it
+_MANY = 20  # rows
 
 Reader = Callable[[Path, PositionOptions], PositionLog]
 
@@ -81,10 +86,31 @@ def is_of_positions(head: str) -> bool:
     return _is_nmea(head) or _is_rtklib(head) or _is_odm(head) or (_is_gpx(head) and _GPX_POINT in head)
 
 
+def is_of_radio(head: str) -> bool:
+    """Return whether a file with this beginning has positions that a radio computed; it may have ranges, too."""
+    return _is_dwm1001(head) or _is_marvelmind(head)
+
+
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
     given = options.columns or options.unit or options.timestamp_unit
     unit = "s" if not given and POSITIONS.is_canonical(read_head(path)) else options.timestamp_unit
-    return _log_of_table(POSITIONS.read(path, options.columns, options.unit, every_row=False), options, unit)
+    table = POSITIONS.read(path, options.columns, options.unit, every_row=False)
+    if options.unit is None:
+        _require_unit(table)
+    return _log_of_table(table, options, unit)
+
+
+def _require_unit(table: TextTable) -> None:
+    """Raise UnclearFileError if many coordinates are whole numbers without a unit: nobody measures whole metres."""
+    if len(table) < _MANY or any(terms.named_length_unit(table.names[axis]) for axis in AXES):
+        return
+    coordinates = np.concatenate([table.numbers(axis, empty=np.nan, missing=MISSING) for axis in AXES])
+    known = coordinates[np.isfinite(coordinates)]
+    layout = find_layout(table.path)
+    if layout is not None and len(np.unique(known)) > len(AXES) and np.all(known == np.round(known)):
+        choices = [POSITIONS.choice(f"if they are in {unit}", table.names, unit=unit) for unit in ("mm", "cm", "m")]
+        why = ["the coordinates are whole numbers without a unit"]
+        raise unclear_table(POSITIONS.what, table.path, layout, why, choices)
 
 
 def _log_of_table(
@@ -224,6 +250,26 @@ def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
     """Read the dashboard's CSV (operation manual, "CSV format")."""
     table = read_without_header(path, ("timestamp", "interval", "count", "tag_id", *AXES), has_more=True)
     return _log_of_table(table, options, "ms", "marvelmind")
+
+
+def _is_dwm1001(head: str) -> bool:
+    return _DWM1001.search(head) is not None
+
+
+def _read_dwm1001(path: Path, options: PositionOptions) -> PositionLog:
+    """Read the positions that the commands lep, lec and les of the DWM1001 print, with the host's time in front."""
+    clock, times_s, rows, lines = Clock(options.timestamp_unit), list[float](), list[list[float]](), list[int]()
+    for line, text in enumerate(read_text(path, errors="replace").split("\n"), 1):
+        found, begin = _DWM1001.search(text), _DWM1001_BEGIN.search(text)
+        if found is not None and begin is not None:
+            times_s.append(clock.find_seconds(text[: begin.start()]))
+            rows.append([*map(float, found.groups())])
+            lines.append(line)
+            if np.isnan(times_s[-1]):
+                raise InputError(f"no time before the position; {RECORD_TIMES}", path, line)
+    unknown = np.full((len(rows), 3, 3), np.nan)
+    places = np.array(rows).reshape(-1, 3)
+    return PositionLog.in_time_order(path, "dwm1001", places, ByTime(np.array(times_s)), lines, covariance_m2=unknown)
 
 
 def _is_nmea(head: str) -> bool:
@@ -413,6 +459,7 @@ POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "gpx": (_is_gpx, _read_gpx),
     "odm": (_is_odm, _read_odm),
     "tum": (_is_tum, _read_tum),
+    "dwm1001": (_is_dwm1001, _read_dwm1001),
     "marvelmind": (_is_marvelmind, _read_marvelmind),
     "table": (POSITIONS.is_canonical, _read_table),
 }

@@ -21,7 +21,7 @@ from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
 from rangesfm.measurements.lengths.metashape import is_metashape_file, read_metashape_markers
 from rangesfm.measurements.positions import position_columns
 from rangesfm.measurements.positions.control_point_file import is_point_file
-from rangesfm.measurements.positions.position_formats import is_of_positions
+from rangesfm.measurements.positions.position_formats import is_of_positions, is_of_radio
 from rangesfm.measurements.ranges.anchors import anchor_file
 from rangesfm.measurements.ranges.errors.error_curve import is_error_curve_file
 from rangesfm.measurements.ranges.readers import find_log_reader, read_ranges
@@ -36,7 +36,7 @@ from rangesfm.survey.discovery.calibration_files import CameraCalibration, read_
 from rangesfm.survey.sources.bag import has_images
 from rangesfm.survey.sources.source import is_video
 from rangesfm.util.files.bags import is_bag, is_bag_folder
-from rangesfm.util.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
+from rangesfm.util.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, OTHER_PHOTOS, walk
 from rangesfm.util.files.text_tables import header_names, read_head
 from rangesfm.util.geometry.reference import is_reference_file, is_tum_row
 
@@ -50,7 +50,7 @@ _MEASURED = frozenset(
 _BY_SLAM = frozenset({"slam", "orb", "vo", "keyframe", "keyframes", "key", "estimate", "estimated"})
 _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
-    **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
+    **dict.fromkeys(OTHER_PHOTOS, "convert them to JPEG"),
     **dict.fromkeys((".xlsx", ".xls", ".ods", ".numbers"), "save the sheet as CSV"),
     **dict.fromkeys((".xml", ".jxl", ".dxf", ".dwg", ".shp", ".kml", ".kmz", ".rw5"), "export points as CSV"),
 }
@@ -237,6 +237,8 @@ def _key_of(path: Path) -> str | None:
         return LOG
     if is_imu_log(path):
         return IMU
+    if is_of_radio(head):
+        return POSITIONS
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
         return _measured_or_true(path) if key == REFERENCE else key
     with nullcontext() if is_table else suppress(UnclearFileError):

@@ -18,6 +18,7 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 _SQLITE_COUNTERS = ((24, 28), (92, 96))
 
 _LFS_POINTER = b"version https://git-lfs.github.com/"
+_HEIC = re.compile(rb".{4}ftyp(?:heic|heix|hevc|mif1|msf1)", re.DOTALL)
 _HTML = re.compile(rb"(?:\xef\xbb\xbf)?\s{0,99}<(?:!doctype html|html)\b", re.IGNORECASE)
 
 State = tuple[int, int, int]
@@ -40,11 +41,13 @@ def open_regular(path: AnyPath) -> BinaryIO:
 
 
 def stand_in(path: AnyPath, head: bytes) -> str:
-    """Return what a file with this beginning is, if it was stored in place of the wanted one; "" if it is none."""
+    """Return what a file with this beginning is, if it is stored in place of the wanted one; "" if it is none."""
     if head.startswith(_LFS_POINTER):
         return "is a pointer of Git LFS in place of the file itself: fetch that (git lfs pull)"
     if _HTML.match(head) and not str(path).lower().endswith((".html", ".htm")):
         return "is an HTML page in place of the file itself: download that again"
+    if _HEIC.match(head):
+        return "is a HEIC photo, whatever its name says: convert it to JPEG"
     return ""
 
 

@@ -13,6 +13,8 @@ LEFT_BY_RUNS = frozenset({"result.json", "reconstruct.json", "photos.json"})
 """Names of files that mark a folder as the result of an earlier run."""
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Endings of the names of photos, in small letters."""
+OTHER_PHOTOS = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
+"""Endings of the names of photos that are not read."""
 
 
 def natural_order(name: str) -> tuple[list[str], str]:

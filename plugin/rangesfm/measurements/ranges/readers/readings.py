@@ -22,6 +22,11 @@ from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT
 from rangesfm.measurements.ranges.readers.units import SLOWEST_S, time_unit, which_unit
 from rangesfm.options import TIME_S, RangesOptions
 
+RECORD_TIMES = (
+    "this radio prints no times, so record the log with the host's time at the beginning of each line (seconds, ms, us "
+    "or ns, or 2026-01-31T12:00:00.000Z)"
+)
+
 
 class Reading(NamedTuple):
     """A range as a radio reports it (see RangeLog); one that is not a positive number means no measurement.
@@ -70,8 +75,7 @@ def log_of_readings(
         of_times.append("no time of the host in front of the lines: the time is the radio's count")
     if np.isnan(times_s).any():
         raise InputError(
-            "no time before the range; this radio prints no times, so record the log with the host's time at the "
-            "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
+            f"no time before the range; {RECORD_TIMES}",
             path,
             lines[int(np.argmax(np.isnan(times_s)))],
         )

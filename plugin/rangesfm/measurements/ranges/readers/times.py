@@ -105,15 +105,21 @@ def _hour(hour: str, half: str | None) -> int:
 def time_in_front(text: str) -> str | None:
     """Return the civil time in a text, or else the number if there is nothing beside it but marks such as brackets.
 
-    A whole number counts only if it is a time since 1970; others number the lines.
+    A whole number counts only if it is a time since 1970; others number the lines. A time since 1970 at the beginning
+    counts whatever follows it, such as the topic of a message of MQTT.
     """
     if civil := CIVIL_TIME.search(text) or TIME_OF_DAY.search(text):
         return civil[0]
     number = _NUMBER.search(text)
+    if number and not text[: number.start()].strip("[( ") and _is_since_1970(number[0]):
+        return number[0]
     if number is None or re.search("[A-Za-z0-9]", text.replace(number[0], "", 1)):
         return None
-    is_time = "." in number[0] or unit_by_digits(float(number[0])) or are_seconds_since_1970(float(number[0]))
-    return number[0] if is_time else None
+    return number[0] if "." in number[0] or _is_since_1970(number[0]) else None
+
+
+def _is_since_1970(number: str) -> bool:
+    return unit_by_digits(float(number)) is not None or are_seconds_since_1970(float(number))
 
 
 class Clock:
