@@ -130,7 +130,8 @@ def without_similarity(by_pose: Array, path: Trajectory, is_firm: Mask, *, frame
 def similarity_of(path: Trajectory, is_firm: Mask, *, frame_is_free: bool) -> Array:
     """Return the (7, 6 k) derivatives of the similarity of a path by its poses; arguments as above."""
     motions = _motions(path)
-    weights = np.outer(is_firm, np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3)).ravel()
+    size = float(np.linalg.norm(path.centers.std(axis=0))) or 1.0
+    weights = np.outer(is_firm, np.repeat([size * _TURNS_COUNT, 1.0], 3)).ravel()
     weighted = motions * weights[:, None]
     lengths = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)  # in no unit, so that none is too small to count
     of_poses = np.linalg.pinv(weighted / lengths, rcond=1e-6) / lengths[:, None] * weights
@@ -155,10 +156,6 @@ def motions_of_poses(world_from_rig: Array, from_origin: Array) -> Array:
 
 def _motions(path: Trajectory) -> Array:
     return motions_of_poses(path.world_from_cam, path.centers - path.centers[0]).reshape(-1, 7)
-
-
-def _size(path: Trajectory) -> float:
-    return float(np.linalg.norm(path.centers.std(axis=0))) or 1.0
 
 
 @dataclass(frozen=True)

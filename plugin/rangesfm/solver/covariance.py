@@ -191,10 +191,8 @@ class _Inverse:
         held = np.zeros(len(self._scale))
         held[linalg.qr(self.free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
         self._starts = columns.starts
-        self._factor = _factored(self._scaled(normal) + diags_array(held), columns)
-
-    def _scaled(self, matrix: Array | csr_array) -> Array | csr_array:
-        return diags_array(self._scale[:, 0]) @ matrix @ diags_array(self._scale[:, 0])
+        scale = diags_array(self._scale[:, 0])
+        self._factor = _factored(scale @ normal @ scale + diags_array(held), columns)
 
     def solve(self, right: Array) -> Array:
         """Solve for a right side (size, k)."""

@@ -101,8 +101,8 @@ class RangingInputs:
     def listed_photos(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield the photos that each file names, after what it says of them."""
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
-        for markers in filter(None, [points.markers or tape.markers]):
-            yield f"marks in {_name(next(iter(markers.values())).path)}", _photos_of(markers)
+        if markers := [*(points.markers or tape.markers).values()]:
+            yield f"marks in {_name(markers[0].path)}", tuple(photo for each in markers for photo in each.image_names)
         if antenna is not None and isinstance(antenna.log.moments, ByPhoto):
             yield f"positions in {_name(antenna.log.path)}", antenna.log.moments.image_name
         if isinstance(self.log.moments, ByPhoto):
@@ -118,10 +118,6 @@ class RangingInputs:
 
 def _name(path: Path | None) -> str:
     return "the file" if path is None else path.name
-
-
-def _photos_of(markers: Mapping[str, Marker]) -> tuple[str, ...]:
-    return tuple(photo for marker in markers.values() for photo in marker.image_names)
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:
