@@ -60,7 +60,7 @@ def ranges_at_truth(planned: PlannedSurvey, bending: MapBending, others: Sequenc
     stddev_m = np.sqrt(noise_m**2 + placing_m**2 + prior.shared_m**2)
     errors = replace(prior.at(tags_m, placing_m), stddev_m=stddev_m)
     weights = np.full(len(posed.rows), float(planned.num_alike))
-    return RangeScale.begun(RangesOnMap.at(posed, state, weights, errors, noise_m))
+    return RangeScale.begun(RangesOnMap(posed, state, weights, errors, noise_m))
 
 
 def true_state(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:

@@ -18,6 +18,7 @@ from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, Rang
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
 from rangesfm.solver.bending import Bending
+from rangesfm.util.geometry.moments import ByTime
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 from rangesfm.util.geometry.trajectory import OnPath
 
@@ -72,6 +73,7 @@ def small_map(
                 tag_ids=("T", "U")[:num_tags],
                 tag_index=np.append(tag_index, 7),
                 shared_stddev_m=np.full(num, np.nan),
+                moments=ByTime(np.asarray(BEGIN_S + seconds)),
             ),
             subset=lambda rows: OnPath(points[rows], points[rows] + 1, np.zeros(len(rows))),
             placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
@@ -86,6 +88,7 @@ def small_map(
     return RangesOnMap(
         posed=ScaleProblem(
             given=given,
+            bending=rigid,
             ranges=problem,
             model_from_path=IDENTITY,
             model_from_cam=model_from_cam,
@@ -95,11 +98,9 @@ def small_map(
             left_out=(),
         ),
         state=state,
-        time_s=np.asarray(BEGIN_S + seconds),
         weights=np.ones(num),
         errors=errors,
         noise_stddev_m=0.0,
-        bending=rigid,
     )
 
 

@@ -281,7 +281,7 @@ def _on_given_path(
     )
     given = RangesOnPath(observations, WalkBending(still), (), "unknown", model)
     upright = np.tile(np.eye(3), (len(rows), 1, 1))
-    return ScaleProblem(given, ranges, IDENTITY, upright, None, rows, (), ())
+    return ScaleProblem(given, given.bending, ranges, IDENTITY, upright, None, rows, (), ())
 
 
 def _located(posed: ScaleProblem) -> Iterator[tuple[int, Linearized, RangesOnMap]]:

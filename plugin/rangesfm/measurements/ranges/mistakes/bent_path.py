@@ -34,7 +34,7 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
             drifts by metres may fit better turned over, with its anchors on the wrong side. So each is bent, too, and
             one that is then much likelier is taken.
     """
-    if not isinstance(on_map.bending, WalkBending):
+    if not isinstance(on_map.posed.bending, WalkBending):
         return on_map
     problem, bent = linearized(on_map), _bent(on_map)
     if not drifts(problem.at_other_map(bent)):
@@ -66,7 +66,7 @@ def _bent(on_map: RangesOnMap) -> RangesOnMap:
 
 def as_given(on_map: RangesOnMap) -> RangesOnMap:
     """Return the map before it was bent to the ranges, at the same state."""
-    walk = on_map.bending
+    walk = on_map.posed.bending
     if not isinstance(walk, WalkBending) or not walk.is_corrected:
         return on_map
     return _on_path(on_map, walk, WalkBending(walk.given))
@@ -74,7 +74,7 @@ def as_given(on_map: RangesOnMap) -> RangesOnMap:
 
 def bends_m(on_map: RangesOnMap) -> Array:
     """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
-    walk, scale = on_map.bending, on_map.metric_from_path.scale
+    walk, scale = on_map.posed.bending, on_map.metric_from_path.scale
     if not isinstance(walk, WalkBending) or not walk.is_corrected:
         return np.zeros(0)
     return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))
@@ -86,7 +86,7 @@ def drifts(problem: Linearized) -> bool:
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:
-    on_map, walk = problem.on_map, problem.on_map.bending
+    on_map, walk = problem.on_map, problem.on_map.posed.bending
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     moved, stddevs_m = problem.after_step(), problem.noise.stddev_of_component
@@ -101,7 +101,7 @@ def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> Ra
     """Return the ranges moved along from one path to another."""
     turns = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
     posed = on_map.posed.carried(turns, after.path.centers - before.path.centers)
-    return replace(on_map, posed=posed, bending=after)
+    return replace(on_map, posed=replace(posed, bending=after))
 
 
 @dataclass(frozen=True)

@@ -231,7 +231,7 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Mistake]) 
     """Yield those mistakes without a size that make the ranges likelier than chance would."""
     if not tried:
         return
-    is_walk = isinstance(problem.on_map.bending, WalkBending)
+    is_walk = isinstance(problem.on_map.posed.bending, WalkBending)
     fits = best_refits(as_given(problem.on_map), problem.scatter_m, tried, _NUM_FITTED)
     # Its squares do not decide: by the errors that last, an explanation with larger squares may be the likelier one.
     found = []

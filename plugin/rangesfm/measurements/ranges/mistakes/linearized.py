@@ -57,7 +57,7 @@ class Linearized(JointProblem):
     @classmethod
     def by_ranges(cls, observed: BinnedRanges, on_map: RangesOnMap, scatter_m: float) -> Linearized:
         """Return the problem of ranges that were averaged on a map, with the usual sizes of their errors."""
-        problem = joined([observed], on_map.bending)
+        problem = joined([observed], on_map.posed.bending)
         return cls(**vars(problem), on_map=on_map, bins=observed.bins, scatter_m=scatter_m)
 
     @cached_property

@@ -64,7 +64,7 @@ def in_bins(
     return BinnedRanges(
         **vars(on_map.linearized(bins)),
         kind=RANGES,
-        by_pose=bins.by_pose(on_map.by_poses, len(on_map.bending.path)),
+        by_pose=bins.by_pose(on_map.by_poses, len(on_map.posed.bending.path)),
         components=widened(on_map.errors_of(bins, others_m2), noise_m),
         alone_m2=np.diag(alone_m2),
         is_used=np.ones(len(bins), dtype=bool),

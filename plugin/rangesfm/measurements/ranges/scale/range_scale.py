@@ -92,7 +92,7 @@ class RangeScale(KindOnMap):
     def alone(self) -> JointMap:
         """The map by the ranges alone, solved anew; from here, if they alone leave it open."""
         own = replace(self, solved=self._without_others)
-        return join_kinds((own,), own.start, self.solved.bending)
+        return join_kinds((own,), own.start, self.solved.posed.bending)
 
     @cached_property
     def _without_others(self) -> RangesOnMap:
@@ -124,7 +124,7 @@ class RangeScale(KindOnMap):
 
     def moved(self, known: Posterior, bent: FrameSteps = NO_STEPS) -> RangeScale:
         """Return the ranges on the map that was bent and moved to the estimate of a posterior; weights stay."""
-        path = self.solved.bending.path
+        path = self.solved.posed.bending.path
         turns, shifts_m = bent.at(path.frame_ids)
         in_world = Rotation.from_rotvec(np.einsum("kij,kj->ki", path.world_from_cam, turns))
         posed = self.solved.posed.carried(in_world.as_matrix(), shifts_m)

@@ -119,7 +119,7 @@ class RangesAtRest(Located):
         turns, velocity = turns_and_velocities(posed.observations, posed.rows, unscaled)
         posed = replace(
             posed,
-            given=replace(posed.given, bending=self.bending),
+            bending=self.bending,
             ranges=problem,
             model_from_path=model_from_path,
             model_from_cam=turns,
@@ -130,7 +130,7 @@ class RangesAtRest(Located):
         state = RangeState(placed, anchors_m, np.array(biases_m))
         off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
         weights, noise_m = ranges.errors.robust_weights(off_m), float(np.median(ranges.errors.stddev_m))
-        here = RangesOnMap.at(posed, state, weights, ranges.errors, noise_m)
+        here = RangesOnMap(posed, state, weights, ranges.errors, noise_m)
         return RangeScale(here, self.before.told, self.before.notes)
 
 

@@ -28,7 +28,6 @@ from rangesfm.measurements.ranges.scale.range_equation import (
     solve,
 )
 from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component
 from rangesfm.util.geometry.similarity import Similarity
@@ -41,22 +40,18 @@ class RangesOnMap:
     Attributes:
         posed: their scale problem; corrected where a mistake is undone, and carried along where the map is bent.
         state: of the map and the anchors.
-        time_s: (n,) as ``ScaleProblem.times_s``.
         weights: (n,) robust weights in the solution; larger than 1 for a range that stands for several.
         errors: of the ranges, as weighted in the solution, whose formal standard deviations their inflation multiplies.
         noise_stddev_m: standard deviation of an ordinary range, estimated from the solution.
-        bending: of the map.
         rivals: states of other maps that fit worse, the likeliest first.
         why_open: why the map also fits in another place of the site, with the same scale; empty if it does not.
     """
 
     posed: ScaleProblem
     state: RangeState
-    time_s: Array
     weights: Array
     errors: RangeErrors
     noise_stddev_m: float
-    bending: MapBending
     rivals: tuple[RangeState, ...] = ()
     why_open: str = ""
 
@@ -75,13 +70,10 @@ class RangesOnMap:
         """Formal standard deviation of the logarithm of the scale."""
         return fit_at(self.weighted, self.state, self.weights).log_scale_stddev
 
-    @classmethod
-    def at(
-        cls, posed: ScaleProblem, state: RangeState, weights: Array, errors: RangeErrors, noise_m: float
-    ) -> RangesOnMap:
-        """Return the ranges at a state of the path on which they are posed."""
-        times_s = posed.times_s(state.metric_from_model.scale)
-        return cls(posed, state, times_s, weights, errors, noise_m, posed.given.bending)
+    @cached_property
+    def time_s(self) -> Array:
+        """(n,) times of the ranges, as ``ScaleProblem.times_s``."""
+        return self.posed.times_s(self.state.metric_from_model.scale)
 
     def with_problem(self, problem: RangeProblem) -> RangesOnMap:
         """Return the ranges with another problem of them, at the same state."""
@@ -91,8 +83,7 @@ class RangesOnMap:
         """Return the ranges at the solution of another problem of them, near their state, with the same errors."""
         changed = self.with_problem(problem)
         fit = solve(changed.weighted, self.state, loss=self.errors.loss)
-        times_s = changed.posed.times_s(fit.state.metric_from_model.scale)
-        return replace(changed, state=fit.state, time_s=times_s, weights=fit.weights)
+        return replace(changed, state=fit.state, weights=fit.weights)
 
     @property
     def anchor_ids(self) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_steep
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
+from rangesfm.solver.bending import MapBending
 from rangesfm.solver.posterior import ScaleByKind
 from rangesfm.util.geometry.moments import ByPhoto, ByTime
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
@@ -39,7 +40,8 @@ class ScaleProblem:
     """A RangeProblem and how it belongs to the survey.
 
     Attributes:
-        given: the ranges on the path.
+        given: the ranges on the path of the unscaled model.
+        bending: of the path on which they are, that one or another which the map became.
         ranges: the problem; its model world is the first camera's frame, unscaled.
         model_from_path: from the world of the map's path to that.
         model_from_cam: (k, 3, 3) rotations of the keyframe nearest to each range.
@@ -51,6 +53,7 @@ class ScaleProblem:
     """
 
     given: RangesOnPath
+    bending: MapBending
     ranges: RangeProblem
     model_from_path: Similarity
     model_from_cam: Array
@@ -162,11 +165,9 @@ def scale_problem(
     bias_m = np.array([a.range_bias_m for a in in_log])
     stddevs_m = (a.range_bias_stddev_m for a in in_log)
     bias_stddev_m = np.array([range_model.range_bias_stddev_m if each is None else each for each in stddevs_m])
-    distances, in_site = given.distances, anchor_frame == "site" and bool(known.any())
-    if anchor_frame == "site" and not in_site:
-        distances = distances.joined(_between_surveyed(in_log, surveyed & heard))
-    noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
-    distances = distances.joined(lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
+    in_site = anchor_frame == "site" and bool(known.any())
+    apart = surveyed & heard & (anchor_frame == "site" and not in_site)
+    distances = _between_anchors(given, in_log, apart, bias_m, bias_stddev_m)
     has_ends = np.asarray((heard | placed)[distances.anchor_pair].all(axis=1))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
@@ -179,7 +180,7 @@ def scale_problem(
         anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
         bias_mean_m=bias_m,
         bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
-        common_bias_stddev_m=common_stddev_m,
+        common_bias_stddev_m=range_model.common_bias_stddev_m,
         frame_is_free=in_site or placement is not None,
         share=errors.share,
         distances=distances.subset(has_ends),
@@ -187,8 +188,8 @@ def scale_problem(
         placement=placement,
         scales=scales,
     )
-    turns, velocity = turns_and_velocities(observations, rows, path)
-    return ScaleProblem(given, ranges, first_camera_from(path), turns, velocity, rows, tuple(notes), left_out)
+    moving = turns_and_velocities(observations, rows, path)
+    return ScaleProblem(given, given.bending, ranges, first_camera_from(path), *moving, rows, tuple(notes), left_out)
 
 
 def turns_and_velocities(
@@ -274,10 +275,18 @@ def _usable_positions(
     return np.zeros(len(anchors), dtype=bool), [note]
 
 
-def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> AnchorDistances:
-    """Return the distances between anchors with given positions; they hold in any frame."""
-    ids = [anchor.anchor_id for anchor in anchors]
-    pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
+def _between_anchors(
+    given: RangesOnPath, anchors: Sequence[Anchor], apart: Mask, bias_m: Array, bias_stddev_m: Array
+) -> AnchorDistances:
+    """Return the lengths between anchors that were measured, taped ones first, which hold in any frame.
+
+    Args:
+        anchors: m of the log. apart: (m,) those of whose positions the distances are used. bias_m, bias_stddev_m: (m,).
+    """
+    ids, model = [anchor.anchor_id for anchor in anchors], given.range_model
+    pairs = surveyed_distances([anchor for anchor, k in zip(anchors, apart, strict=True) if k])
     lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
     ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs], dtype=np.int64).reshape(-1, 2)
-    return AnchorDistances(ends, lengths_m, stddevs_m)
+    noise_m, common_stddev_m = model.range_stddev_m or START_STDDEV_M, model.common_bias_stddev_m
+    by_radio = lengths_by_radio(given.observations.log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
+    return given.distances.joined(AnchorDistances(ends, lengths_m, stddevs_m)).joined(by_radio)

@@ -193,7 +193,7 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> RangesOnMap:
         if last.noise_m > _FALLS * used.noise_m:
             break
         used, state = last, fit.state
-    return RangesOnMap.at(posed, fit.state, fit.weights, used, last.noise_m)
+    return RangesOnMap(posed, fit.state, fit.weights, used, last.noise_m)
 
 
 def with_unknown_anchors(on_map: RangesOnMap) -> RangesOnMap:
