@@ -18,7 +18,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.outliers import spoilt
 from tests.simulated.path import along, loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
-from tests.simulated.surveys import range_log
+from tests.simulated.surveys import adjusted, range_log
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
@@ -127,7 +127,7 @@ def make_survey(
     model_options = {"num_observations": 60, **model_options}
     model = synthetic_model(*along(path, times), pixel_stddev=pixel_stddev, seed=seed, **model_options)
     if pixel_stddev > 0:
-        adjust_by_colmap(model.reconstruction)
+        adjusted(model.reconstruction)
     radio = radio or Radio()
     if at_keyframes:
         each = np.repeat(np.arange(num_keyframes), num_epochs)
@@ -148,19 +148,6 @@ def make_survey(
         from_world.apply(model.centers_m),
         {name: from_world.apply(np.array(position)) for name, position in anchors_m.items()},
     )
-
-
-def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
-    """Adjust a noisy model as a mapper would."""
-    config = pycolmap.BundleAdjustmentConfig()
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for image_id in sfm.reg_image_ids():
-        config.add_image(image_id)
-    options = pycolmap.BundleAdjustmentOptions(
-        print_summary=False, refine_focal_length=False, refine_extra_params=False
-    )
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, sfm).solve()
 
 
 class TestWithoutNoise:

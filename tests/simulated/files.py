@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 
@@ -22,12 +23,15 @@ def write_model(sfm: pycolmap.Reconstruction, sparse: Path, timestamps_s: Mappin
 
 def write_marks(path: Path, model: pycolmap.Reconstruction, points: Mapping[str, int]) -> None:
     """Write the features of points, given by their ids, as marks of these names."""
-    rows = []
-    for name, point_id in points.items():
-        for element in model.point3D(point_id).track.elements:
-            image = model.image(element.image_id)
-            rows.append((name, image.name, *map(float, image.points2D[element.point2D_idx].xy)))
+    seen = {name: features_of(model, point_id) for name, point_id in points.items()}
+    rows = ((name, photo, *xy) for name, of_photo in seen.items() for photo, xy in of_photo.items())
     write_rows(path, "marker,image_name,x_px,y_px", rows)
+
+
+def features_of(model: pycolmap.Reconstruction, point_id: int) -> dict[str, list[float]]:
+    """Return the feature of a point, [x, y], by photo; one of them where a real photo has several."""
+    seen = ((model.image(each.image_id), each.point2D_idx) for each in model.point3D(point_id).track.elements)
+    return {image.name: np.ravel(image.points2D[index].xy).tolist() for image, index in seen}
 
 
 def write_anchors(path: Path, anchors_m: Mapping[str, Iterable[float]]) -> None:

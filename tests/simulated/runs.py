@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from unittest.mock import patch
@@ -72,11 +72,19 @@ def run_stages(
 
 @dataclass(frozen=True)
 class Run:
-    """The outcome of the scale stage on one survey; None where the scale was refused."""
+    """The outcome of a survey with a radio; there is no estimate where it was refused.
+
+    Attributes:
+        diagnosis: tests of mistakes. doubts: everything that speaks against the map.
+        place_in_stddevs: how far the middle of the map is displaced, in its stated stddevs; 0 without a place.
+        on_map: the ranges after the scale stage alone.
+    """
 
     survey: MadeSurvey
-    estimate: ScaleEstimate | None
-    diagnosis: MistakeTests | None
+    estimate: ScaleEstimate | None = None
+    diagnosis: MistakeTests | None = None
+    doubts: Sequence[str] = ()
+    place_in_stddevs: float = 0.0
     on_map: RangesOnMap | None = None
     refusal: str = ""
 
@@ -87,24 +95,6 @@ class Run:
             return False
         low, high = self.estimate.interval_95
         return not low <= self.survey.metres_per_unit <= high
-
-    @property
-    def doubts(self) -> list[str]:
-        """List everything that speaks against the map of a survey without photos."""
-        assert self.estimate is not None
-        assert self.diagnosis is not None
-        of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
-        return [*self.diagnosis.reasons, *of_scale]
-
-    @property
-    def place_in_stddevs(self) -> float:
-        """Return how far the middle of the map is displaced, in its stated stddevs; 0 without a place."""
-        if self.estimate is None or self.estimate.placement is None:
-            return 0.0
-        centers_m = self.estimate.metric_from_sfm.apply(self.survey.trajectory.centers)
-        of_map, _ = by_similarity(self.estimate.placement, centers_m)
-        off_m = np.nanmean(centers_m - self.survey.true_centers_m, axis=0)
-        return float(np.linalg.norm(off_m) / np.sqrt(np.trace(of_map[4:, 4:])))
 
 
 def run(survey: MadeSurvey, seed: int) -> Run:
@@ -118,10 +108,18 @@ def run(survey: MadeSurvey, seed: int) -> Run:
                 observations, survey.trajectory, survey.anchors, anchor_frame=frame, options=options, seed=seed
             )
     except GeometryError as error:
-        return Run(survey, None, None, refusal=str(error))
-    ranges, on_map = find_kind(estimate.on_map.kinds, RangeScale), estimate.on_map
+        return Run(survey, refusal=str(error))
+    on_map, estimate = estimate.on_map, estimate.where_bent(options)
+    ranges = find_kind(on_map.kinds, RangeScale)
     assert ranges is not None
-    return Run(survey, estimate.where_bent(options), ranges.tests(on_map, {}), ranges.on(on_map))
+    tests, in_stddevs = ranges.tests(on_map, {}), 0.0
+    if estimate.placement is not None:
+        centers_m = estimate.metric_from_sfm.apply(survey.trajectory.centers)
+        of_map, _ = by_similarity(estimate.placement, centers_m)
+        off_m = np.nanmean(centers_m - survey.true_centers_m, axis=0)
+        in_stddevs = float(np.linalg.norm(off_m) / np.sqrt(np.trace(of_map[4:, 4:])))
+    doubts = [*tests.reasons, *(estimate.reasons if estimate.verdict != "good" else ())]
+    return Run(survey, estimate, tests, doubts, in_stddevs, ranges.on(on_map))
 
 
 def _near_truth(survey: MadeSurvey) -> Callable[[RangeProblem, int], list[RangeState]]:
@@ -137,34 +135,16 @@ def _near_truth(survey: MadeSurvey) -> Callable[[RangeProblem, int], list[RangeS
     return starts
 
 
-@dataclass(frozen=True)
-class RunOfPhotos(Run):
-    """The outcome of one survey with photos; no result where it was refused."""
-
-    metric: MetricResult | None = None
-
-    @property
-    def doubts(self) -> list[str]:
-        """List everything that speaks against the map."""
-        assert self.metric is not None
-        estimate, place = self.metric.estimate, self.metric.place
-        of_place = place.reasons if place is not None and place.verdict != "good" else ()
-        return [*(estimate.reasons if estimate.verdict != "good" else ()), *of_place]
-
-    @property
-    def place_in_stddevs(self) -> float:
-        """Return how far the middle of the map is displaced, in its stated stddevs; 0 without a place."""
-        if self.metric is None or self.metric.place is None:
-            return 0.0
-        centers_m = self.metric.trajectory.as_in(self.metric.final).centers
-        off_m = np.mean(centers_m - self.survey.true_centers_m, axis=0)
-        return float(np.linalg.norm(off_m) / np.linalg.norm(self.metric.place.stddev_m))
-
-
-def run_with_photos(survey: MadeSurvey, seed: int) -> RunOfPhotos:
+def run_with_photos(survey: MadeSurvey, seed: int) -> Run:
     """Scale, refine and judge a survey, with all defaults."""
     try:
         metric = run_stages(survey, seed)
     except (GeometryError, SolverError) as error:
-        return RunOfPhotos(survey, None, None, refusal=str(error))
-    return RunOfPhotos(survey, metric.estimate, metric.diagnosis, metric=metric)
+        return Run(survey, refusal=str(error))
+    estimate, place, in_stddevs = metric.estimate, metric.place, 0.0
+    doubts = [*(estimate.reasons if estimate.verdict != "good" else ())]
+    if place is not None:
+        doubts += place.reasons if place.verdict != "good" else ()
+        off_m = np.mean(metric.trajectory.as_in(metric.final).centers - survey.true_centers_m, axis=0)
+        in_stddevs = float(np.linalg.norm(off_m) / np.linalg.norm(place.stddev_m))
+    return Run(survey, estimate, metric.diagnosis, doubts, in_stddevs)

@@ -242,7 +242,7 @@ def yard_truth(anchor_frame: str = "site", max_track_length: int | None = None) 
 def expected_drift_m(truth: Truth) -> float:
     """Return the root mean square error of the keyframes of a map by features with a noise of 1 px, to first order."""
     model = pycolmap.Reconstruction(truth.model.reconstruction)
-    problem = photos_adjuster(truth, model).problem
+    problem = photos_adjuster(model, hold_first=truth.is_in_first_camera).problem
     equations = NormalEquations.of(problem, model, problem.num_residuals())
     covariance = joint_covariance(equations, firm_frame_ids=equations.columns.frames)
     return float(np.sqrt(np.mean(np.trace(covariance.covariances("frame")[:, 3:, 3:], axis1=1, axis2=2))))
@@ -251,10 +251,10 @@ def expected_drift_m(truth: Truth) -> float:
 # The map.
 
 
-def photos_adjuster(truth: Truth, model: pycolmap.Reconstruction) -> pycolmap.CeresBundleAdjuster:
+def photos_adjuster(model: pycolmap.Reconstruction, *, hold_first: bool) -> pycolmap.CeresBundleAdjuster:
     """Return an adjuster of the features, with a gauge that leaves the rest to other measurements."""
     config = _config_of(model, pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
-    if truth.is_in_first_camera:
+    if hold_first:
         config.set_constant_rig_from_world_pose(min(model.reg_frame_ids()))
     return pycolmap.create_default_ceres_bundle_adjuster(_adjustment_options(), config, model)
 

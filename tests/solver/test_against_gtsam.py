@@ -14,13 +14,13 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.surveys import photos_adjuster
 from tests.solver.test_covariance import (
     ANCHORS_M,
     RANGE_STDDEV_M,
     TAG_IN_CAM_M,
     Joint,
     add_ranges,
-    bundle_adjuster,
     model,
 )
 
@@ -88,7 +88,7 @@ def centers_and_rotations(reconstruction: pycolmap.Reconstruction) -> tuple[Arra
 def by_ceres(measured: Measured) -> tuple[Array, Array, MapErrors]:
     """Return centres, anchors and their covariance; the reconstruction is adjusted."""
     reconstruction = measured.reconstruction
-    adjuster = bundle_adjuster(reconstruction, hold_first=False)
+    adjuster = photos_adjuster(reconstruction, hold_first=False)
     problem: Any = adjuster.problem
     num_reprojections = problem.num_residuals()
     poses = [pose_of(reconstruction.frame(i)).params for i in sorted(reconstruction.reg_frame_ids())]

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import along, look_at, orbit_path
+from tests.simulated.surveys import photos_adjuster
 
 from rangesfm.errors import GeometryError
 from rangesfm.solver import (
@@ -110,24 +111,6 @@ def model(seed: int = 0, num_frames: int = NUM_FRAMES) -> pycolmap.Reconstructio
     ).reconstruction
 
 
-def bundle_adjuster(reconstruction: pycolmap.Reconstruction, *, hold_first: bool) -> pycolmap.CeresBundleAdjuster:
-    options = pycolmap.BundleAdjustmentOptions(
-        print_summary=False, refine_focal_length=False, refine_extra_params=False
-    )
-    solver = options.ceres.solver_options
-    solver.num_threads = 1
-    solver.initial_trust_region_radius = 1e8
-    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
-    options.ceres.solver_options = solver
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
-    if hold_first:
-        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
-    return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
-
-
 def joint(
     reconstruction: pycolmap.Reconstruction,
     *,
@@ -136,7 +119,7 @@ def joint(
     hold_anchors: bool = False,
     range_errors_m: Array | None = None,
 ) -> Joint:
-    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    adjuster = photos_adjuster(reconstruction, hold_first=hold_first)
     anchors, biases = list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M]
     survey = Joint(reconstruction, adjuster, anchors, biases, adjuster.problem.num_residuals())
     path = orbit_path(1.4 * len(survey.poses))
@@ -293,7 +276,7 @@ def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> 
     for height_m in (1e-3, 0.3):  # a path that is bent by 0.3 m determines the turn
         bent = centers + np.column_stack([np.zeros((30, 2)), height_m * np.sin(0.2 * times)])
         made = synthetic_model(times, bent, look_at(bent, bent + sway), num_observations=40, metric_from_sfm=IDENTITY)
-        adjuster = bundle_adjuster(made.reconstruction, hold_first=False)
+        adjuster = photos_adjuster(made.reconstruction, hold_first=False)
         survey = Joint(made.reconstruction, adjuster, anchors, [np.zeros(1)], adjuster.problem.num_residuals())
         for pose, center in zip(survey.poses, bent, strict=True):
             for anchor in anchors:
@@ -314,7 +297,7 @@ def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> 
 def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
     """Return the model adjusted to its photos alone, without ranges, and its adjuster."""
     reconstruction = model()
-    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    adjuster = photos_adjuster(reconstruction, hold_first=hold_first)
     adjuster.solve()
     return reconstruction, adjuster
 

@@ -5,8 +5,8 @@ Run: python -m tests.studies.advice_followed [--out FILE] [--num_seeds 100] [--k
 For each survey, three pieces of advice are followed: the first for the scale, the first for the scale that is no taped
 distance, and the first for the place. Prints what each promises and what it achieves, as the stddev afterwards relative
 to that before: predicted, and by the spread of simulated runs. Where nothing is known before (open), the stddevs
-afterwards are compared. Control points are left out, as these surveys have no photos. FILE keeps the runs that are
-done, as in ``planned_surveys``.
+afterwards are compared. Left out are control points, as these surveys have no photos, and other kinds of measurement,
+such as an inertial sensor, which ``planned_surveys`` does not simulate. FILE keeps the runs that are done.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
     """Yield the first pieces of advice, each with its purpose, "scale" or "place"."""
     for_scale, for_place = (
-        [advice for advice in each if advice.kind != "control points"]
+        [advice for advice in each if not (advice.planned.points or advice.planned.others)]
         for each in (plan.advice_for_scale, plan.advice_for_place)
     )
     yield from (("scale", advice) for advice in for_scale[:1] if advice.kind == "tape")

@@ -61,7 +61,7 @@ from tests.simulated.surveys import (
 )
 from tests.studies.kept_runs import runs_of, seeds_parser
 from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, Receiver, antenna_track
-from tests.studies.measured_distances import MAST_M, marks_in
+from tests.studies.measured_distances import MAST_M, MAX_NUM_PHOTOS, clicked, marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import RangesfmError
@@ -215,22 +215,11 @@ class LapWithoutRanges:
             apart_m = np.linalg.norm(places - places[start], axis=1)
             other = int(rng.choice(np.flatnonzero((apart_m > TAPED_M[0]) & (apart_m < TAPED_M[1]))))
             for k in (start, other):
-                markers[f"mark{k}"] = self._clicked(ids[k], rng)
+                seen_by = model.point3D(ids[k]).track.elements[:MAX_NUM_PHOTOS]
+                markers[f"mark{k}"] = clicked(places[k], [model.image(each.image_id) for each in seen_by], rng)
             measured_m = float(apart_m[other]) + LENGTH_STDDEV_M * float(rng.standard_normal())
             taped.append(TapedDistance((f"mark{start}", f"mark{other}"), measured_m, LENGTH_STDDEV_M, CONTROL, 0))
         return Tape(tuple(taped), markers)
-
-    def _clicked(self, point_id: int, rng: np.random.Generator) -> Marker:
-        model = self.truth.model.reconstruction
-        point = model.point3D(point_id)
-        images = [model.image(element.image_id) for element in point.track.elements][:4]
-        pixels = np.array([image.project_point(point.xyz) for image in images], np.float64)
-        return Marker(
-            tuple(image.name for image in images),
-            pixels + rng.standard_normal(pixels.shape),
-            (0,) * len(images),
-            1.0,
-        )
 
     def inputs(self, kind: str) -> RangingInputs:
         """Return what is measured in a survey of a kind; successive seeds go through the numbers of it."""

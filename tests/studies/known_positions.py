@@ -201,7 +201,7 @@ class Known:
         antenna = self.surveyed.antenna
         known_offset = antenna and replace(antenna, offset=TimeOffset.given(0.0))
         known = replace(self.surveyed, antenna=known_offset).located(truth.reconstruction, path)
-        photos_problem = photos_adjuster(self.truth, truth.reconstruction).problem
+        photos_problem = photos_adjuster(truth.reconstruction, hold_first=self.truth.is_in_first_camera).problem
         photos = PhotosAlone(
             NormalEquations.of(photos_problem, truth.reconstruction, photos_problem.num_residuals()), pixel_stddev
         )

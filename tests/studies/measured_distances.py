@@ -18,13 +18,14 @@ status 1 if the share of distances between marks, over all surveys, is not withi
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
 from tests.simulated.runs import run_stages
 from tests.simulated.surveys import HALL, SITE_ANCHORS_M, Kind, Truth, simulated
@@ -93,6 +94,13 @@ KINDS = {
 }  # fmt: skip
 
 
+def clicked(place: Array, images: Sequence[pycolmap.Image], rng: np.random.Generator) -> Marker:
+    """Return marks of a place (3,) in photos, with the errors of somebody who clicks."""
+    pixels = np.array([image.project_point(place) for image in images], np.float64)
+    pixels += MARK_STDDEV_PX * rng.standard_normal(pixels.shape)
+    return Marker(tuple(image.name for image in images), pixels, (0,) * len(images), MARK_STDDEV_PX)
+
+
 def marks_in(truth: Truth, rng: np.random.Generator) -> tuple[dict[str, Marker], dict[str, Array]]:
     """Return marks in photos at points of the scene, and their true positions."""
     model = truth.model.reconstruction
@@ -102,10 +110,7 @@ def marks_in(truth: Truth, rng: np.random.Generator) -> tuple[dict[str, Marker],
         point = model.point3D(point_id)
         images = [model.image(element.image_id) for element in point.track.elements]
         chosen = [images[i] for i in np.unique(np.linspace(0, len(images) - 1, MAX_NUM_PHOTOS).astype(int))]
-        pixels = np.array([np.ravel(image.project_point(point.xyz)) for image in chosen])
-        pixels += MARK_STDDEV_PX * rng.standard_normal(pixels.shape)
-        names = tuple(image.name for image in chosen)
-        markers[f"mark{k}"] = Marker(names, pixels, (0,) * len(names), MARK_STDDEV_PX)
+        markers[f"mark{k}"] = clicked(point.xyz, chosen, rng)
         true_m[f"mark{k}"] = point.xyz
     return markers, true_m
 

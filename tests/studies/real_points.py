@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pycolmap
-from tests.simulated.files import write_marks, write_rows
+from tests.simulated.files import features_of, write_marks, write_rows
 
 from rangesfm.pipeline.run import refine_model
 from rangesfm.survey.settings import Survey
@@ -72,10 +72,9 @@ def main() -> int:
     marked = {f"P{number}": i for number, i in enumerate(spread_points(model, asked.num_points, asked.seed))}
     true_m = []
     for point_id in marked.values():
-        seen = [(model.image(e.image_id), e.point2D_idx) for e in model.point3D(point_id).track.elements]
-        rows = [row_of[image.name] for image, _ in seen]
-        pixels = np.array([image.points2D[index].xy for image, index in seen])
-        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])
+        seen = features_of(model, point_id)
+        rows = [row_of[name] for name in seen]
+        rays = np.column_stack([camera.cam_from_img(np.array([*seen.values()])), np.ones(len(rows))])
         rays = np.einsum("nij,nj->ni", truth.world_from_cam[rows], rays / np.linalg.norm(rays, axis=1)[:, None])
         true_m.append(triangulated(rays, truth.positions_m[rows]))
     places = np.array([model.point3D(i).xyz for i in marked.values()])

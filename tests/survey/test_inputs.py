@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.known import known
+from tests.refused import refused
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeKind
@@ -27,11 +29,7 @@ def survey(tmp_path: Path) -> Survey:
     return Survey(ranges=RangesOptions(path=tmp_path / "uwb.csv"), anchors=AnchorOptions(path=tmp_path / "anchors.csv"))
 
 
-def refusal(survey: Survey) -> InputError:
-    with pytest.raises(InputError) as caught:
-        read_ranging_inputs(survey)
-    assert "\n" not in str(caught.value)
-    return caught.value
+refusal = partial(refused, read_ranging_inputs)
 
 
 def test_each_tag_has_its_lever_arm_in_the_order_of_the_log(survey: Survey) -> None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.refused import refused
 
 from rangesfm.errors import InputError
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.measurements.ranges.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.options import OutputOptions
 from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_reader import NO_OVERRIDES, input_paths, read_survey, survey_from_tables
+from rangesfm.survey.survey_reader import input_paths, read_survey, survey_from_tables
 
 WHOLE = """
 [images]
@@ -75,11 +76,7 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def refusal(path: Path, overrides: Mapping[str, object] = NO_OVERRIDES) -> InputError:
-    with pytest.raises(InputError) as caught:
-        read_survey(path, overrides)
-    assert "\n" not in str(caught.value)
-    return caught.value
+refusal = partial(refused, read_survey)
 
 
 def test_whole_survey_is_read(folder: Path) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.simulated.range_problem import range_problem
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.measurements.ranges.scale import starts
@@ -43,8 +42,21 @@ def wavy_path(num: int) -> Array:
 def placed_at(similarity: Similarity, num: int = 60, gravity: Gravity | None = None) -> RangeProblem:
     """Return exact ranges from a path at a known place among five surveyed anchors, with arms and biases."""
     bias_m = np.array([0.3, -0.2, 0.1, 0.0, 0.4])
-    at = range_problem(wavy_path(num), SITE_M, bias_mean_m=bias_m, gravity=gravity)
-    at = replace(at, tag_from_center=np.random.default_rng(0).normal(0.0, 0.3, (num, 3)))
+    at = RangeProblem(
+        centers=wavy_path(num),
+        tag_from_center=np.random.default_rng(0).normal(0.0, 0.3, (num, 3)),
+        anchor_index=np.arange(num) % len(SITE_M),
+        range_m=np.ones(num),
+        stddev_m=np.full(num, 0.1),
+        anchor_mean_m=SITE_M,
+        anchor_stddev_m=np.zeros(len(SITE_M)),
+        bias_mean_m=bias_m,
+        bias_stddev_m=np.zeros(len(SITE_M)),
+        common_bias_stddev_m=0.0,
+        frame_is_free=True,
+        share=np.ones(num),
+        gravity=gravity,
+    )
     return replace(at, range_m=predicted_ranges(at, RangeState(similarity, SITE_M, bias_m)))
 
 

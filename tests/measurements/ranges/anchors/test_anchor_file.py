@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.known import known
+from tests.refused import refused
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
@@ -33,11 +35,7 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def refusal(path: Path) -> InputError:
-    with pytest.raises(InputError) as caught:
-        read_anchors(path)
-    assert "\n" not in str(caught.value)
-    return caught.value
+refusal = partial(refused, read_anchors)
 
 
 def test_positions_are_read(tmp_path: Path) -> None:

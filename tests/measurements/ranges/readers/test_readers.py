@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.refused import refused
 
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.range_log import RangeLog
@@ -25,11 +27,7 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def refusal(path: Path, **options: object) -> InputError:
-    with pytest.raises(InputError) as caught:
-        read_ranges(path, **options)  # type: ignore[arg-type]
-    assert "\n" not in str(caught.value)
-    return caught.value
+refusal = partial(refused, read_ranges)
 
 
 def anchors_of(log: RangeLog) -> list[str]:
