@@ -279,6 +279,12 @@ def test_items_of_lists_whose_dash_is_alone_in_its_line_are_a_row_each(tmp_path:
     np.testing.assert_array_equal(log.range_m[:2], [9.5, 10.5])
 
 
+def test_lines_of_an_esp32_have_the_time_of_the_board(tmp_path: Path) -> None:
+    log = read_ranges(write(tmp_path, lines(None, lambda t, a, r: f"I ({t * 1000:.0f}) uwb: anchor={a} dist={r:.3f}")))
+    check_times(log)
+    assert [log.anchor_ids[k] for k in log.anchor_index] == [a for _, a, _ in ROWS]
+
+
 def test_an_id_behind_the_word_for_an_anchor_names_it(tmp_path: Path) -> None:
     row = "{} -> Anchor 0x{} distance: {:.3f} m RSSI: -78.2 dBm"
     log = read_ranges(write(tmp_path, lines(None, lambda t, a, r: row.format(clock(t), NUM[a], r))))

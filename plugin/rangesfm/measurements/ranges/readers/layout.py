@@ -97,6 +97,7 @@ _NAMED = re.compile(
     rf"|\b({'|'.join(sorted(ANCHOR | TAG))}) #?(\w*\d\w*)\b(?! ?[=:])",  # Anchor 0x01 distance: 3.45 m
     re.ASCII | re.IGNORECASE,
 )
+_ESP_IDF = re.compile(r"[EWIDV] \((\d{1,10})\) ", re.ASCII)  # I (5230) uwb: and what the board says; ms since its start
 _KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
 # Smallest share of lines or blocks with named values, and of lines with JSON, in a file of records. Boards print other
 # lines beside JSON.
@@ -539,7 +540,9 @@ def _named_records(text: str) -> Iterator[tuple[int, NamedValues]]:
     """
     for line, unit in _units(text):
         time = CIVIL_TIME.search(unit) or TIME_OF_DAY.search(unit)
-        record, num = {"time": time[0]} if time else {}, Counter[str]()
+        counted = _ESP_IDF.match(unit)
+        record = {"time": time[0]} if time else {"time_ms": counted[1]} if counted else {}
+        num = Counter[str]()
         for found in _NAMED.finditer(unit):
             name, value = filter(None, found.groups())
             num[name] += 1
