@@ -149,7 +149,7 @@ def test_some_ranges_stand_for_those_of_their_anchor_that_are_left_out(rng: np.r
     all_of_them = problem.subset(np.repeat(np.arange(NUM_RANGES), num_alike))
     one_of_each = np.cumsum(num_alike) - 1
     by_all, by_some = solve(all_of_them, truth), solve(all_of_them.by_some(one_of_each), truth)
-    assert len(by_some.residuals_m) == NUM_RANGES
+    assert len(by_some.weights) == NUM_RANGES
     assert by_some.cost == pytest.approx(by_all.cost, rel=1e-9)
     np.testing.assert_allclose(by_some.information, by_all.information, rtol=1e-6, atol=1e-6)
 
@@ -157,7 +157,7 @@ def test_some_ranges_stand_for_those_of_their_anchor_that_are_left_out(rng: np.r
 def fit_with(information: Array, problem: RangeProblem, state: RangeState) -> RangeFit:
     num = len(problem.range_m)
     columns = range_equation.columns_of([problem])
-    return RangeFit(state, np.zeros(num), np.ones(num), 0.0, information, columns)
+    return RangeFit(state, np.ones(num), 0.0, information, columns)
 
 
 def test_the_covariance_is_the_inverse_of_the_information_in_any_units(rng: np.random.Generator) -> None:

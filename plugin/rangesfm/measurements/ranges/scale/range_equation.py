@@ -178,7 +178,6 @@ class RangeFit:
 
     Attributes:
         state: the estimate.
-        residuals_m: (n,) predicted minus measured.
         weights: (n,) of the robust loss; 1 for a range that fits.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
@@ -186,7 +185,6 @@ class RangeFit:
     """
 
     state: RangeState
-    residuals_m: Array
     weights: Array
     cost: float
     information: Array
@@ -370,7 +368,6 @@ class _System:
         weighted = jacobian * (self.share * weights)[:, None]
         return RangeFit(
             state=state,
-            residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
             weights=weights,
             cost=cost,
             information=weighted.T @ jacobian + of_priors.T @ of_priors,
