@@ -332,6 +332,12 @@ def test_positions_name_photos_in_other_capitals_without_an_ending_or_with_a_fol
     assert_scale(result.summary, walk.made.metric_from_sfm.scale, 0.01)
 
 
+def test_positions_between_photos_that_are_far_apart_are_told_to_be_so(walk: Walk, tmp_path: Path) -> None:
+    given = {"positions__path": walk.positions(tmp_path), "ranges__max_interpolation_gap_s": 0.5}
+    with pytest.raises(GeometryError, match="no position is near enough to a keyframe in time: use more photos, or"):
+        scale_model(walk.survey(tmp_path, **given), progress=QUIET)
+
+
 def test_positions_of_other_photos_are_refused_with_a_name_of_each(walk: Walk, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"positions\.csv: none of the photos that the file names, such as x_"

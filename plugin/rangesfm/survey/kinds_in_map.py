@@ -88,10 +88,17 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
     )
 
 
+_NO_POSITION_ON_PATH = (
+    "no position is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
+)
+
+
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     surveyed = _with_antenna_at(inputs.positions, {} if at.rest is None else at.rest.state.blocks)
     known, before = surveyed.located(at.model, at.path), find_kind(at.before, PositionScale)
     if not len(known):
+        if surveyed.antenna is not None and surveyed.antenna.other_offset_s is None:
+            raise GeometryError(_NO_POSITION_ON_PATH)
         return None
     begun = PositionScale.begun(known, at.bending, surveyed, is_at_rest=bool(at.before))
     if known.is_check.all() or (before is not None and not before.is_used):
