@@ -14,12 +14,12 @@ from rangesfm.util.files.atomic import new_folder
 _SHRINKING = 8 / 3  # from 960 x 640 pixels to 360 x 240
 
 
-def make_small_demo(folder: Path, *, num_photos: int = 14) -> DemoSurvey:
+def make_small_demo(folder: Path, *, num_photos: int = 14, seed: int = 0, imu: bool = False) -> DemoSurvey:
     """Make the demo's survey beside ``folder``, and in ``folder`` with its photos and its camera scaled down.
 
     An existing folder is left as it is.
     """
-    large = make_demo_survey(folder.with_name(f"{folder.name}_large"), num_photos=num_photos)
+    large = make_demo_survey(folder.with_name(f"{folder.name}_large"), num_photos=num_photos, seed=seed, imu=imu)
     if not folder.exists():
         with new_folder(folder) as new:
             shutil.copytree(large.folder, new, dirs_exist_ok=True)
