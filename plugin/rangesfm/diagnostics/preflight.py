@@ -24,11 +24,11 @@ from rangesfm.measurements.ranges.mistakes.catalogue import LARGEST_RIG_M, SAME_
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers.columns import CANONICAL
 from rangesfm.measurements.ranges.readers.table import MAPPED, TABLE
-from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.util.files.clock_times import are_seconds_since_1970, span_text
 from rangesfm.util.geometry.moments import ByPhoto
+from rangesfm.util.units import TAKEN_FOR_METRES, UNITS_PER_METRE
 
 SAME_PLACE_M = 0.01
 """Two anchors that are nearer to each other than this, metres, are in one place, which cannot be."""
@@ -56,7 +56,7 @@ _MAX_NUM_TRIANGLES, _MAX_NUM_NAMED = 20_000, 2
 # Formats of logs for which the user may give the unit of the ranges.
 _WITH_UNIT = (CANONICAL, MAPPED.name, TABLE.name)
 # Units that are taken for metres.
-_UNITS = {"mm": "millimetres", "cm": "centimetres", "ft": "feet"}
+_UNITS = {unit: TAKEN_FOR_METRES[unit] for unit in ("mm", "cm", "ft")}
 
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:

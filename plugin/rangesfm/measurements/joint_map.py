@@ -25,9 +25,10 @@ from rangesfm.solver.bending import NO_STEPS, FrameSteps, MapBending
 from rangesfm.solver.noise import MAX_NUM_OBSERVATIONS
 from rangesfm.solver.posterior import JointProblem, Observations, Posterior, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.util.geometry.gravity import Gravity
-from rangesfm.util.geometry.numerics import FOOT_M, MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
+from rangesfm.util.units import TAKEN_FOR_METRES, UNITS_PER_METRE
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 
 
-# Units in which numbers are given for metres, and what one metre is in them.
-_UNITS_PER_METRE = {"feet": 1 / FOOT_M, "inches": 12 / FOOT_M, "centimetres": 100.0, "millimetres": 1000.0}
 # Number of measurements for which it is tried what the others say without them, the most deviating first.
 _NUM_SUSPECTS = 3
 
@@ -354,10 +353,11 @@ def _unit_that_explains(large: KindOnMap, small: KindOnMap, apart: float, stddev
     Args:
         large, small: those with the larger and the smaller scale. apart: logarithm of the ratio. stddev: of that.
     """
-    for unit, per_metre in _UNITS_PER_METRE.items():
-        if abs(apart - np.log(per_metre)) < SIGNIFICANT_STDDEVS * stddev < np.log(per_metre):
-            said = f"the {large.words} in {unit}" * large.may_be_in_other_unit
-            converted = f"the {small.words} in metres that were taken for {unit}" * small.may_be_in_other_unit
+    for unit, words in TAKEN_FOR_METRES.items():
+        per_metre = np.log(UNITS_PER_METRE[unit])
+        if abs(apart - per_metre) < SIGNIFICANT_STDDEVS * stddev < per_metre:
+            said = f"the {large.words} in {words}" * large.may_be_in_other_unit
+            converted = f"the {small.words} in metres that were taken for {words}" * small.may_be_in_other_unit
             return f", and {' or '.join(filter(None, (said, converted)))} would explain it"
     return ""
 

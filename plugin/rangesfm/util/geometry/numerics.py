@@ -28,6 +28,3 @@ DOUBTFUL_ABOVE: Final = 0.04
 
 NOTHING_KNOWN: Final = 1.0
 """Relative standard deviation of the scale from which nothing is known about it: it may as well be zero."""
-
-FOOT_M: Final = 0.3048
-"""Metres of the international foot."""

@@ -25,9 +25,9 @@ from rangesfm.measurements.ranges.scale.range_equation import (
 )
 from rangesfm.measurements.ranges.scale.ranges_on_map import RangesOnMap
 from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
-from rangesfm.util.geometry.numerics import FOOT_M
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
+from rangesfm.util.units import FOOT_M
 
 # Ranges of each anchor in a refit: alternatives are only compared.
 _NUM_PER_ANCHOR = 25

@@ -30,7 +30,6 @@ from rangesfm.measurements.ranges.readers.times import (
 from rangesfm.measurements.ranges.readers.unclear import Choice, columns_typed
 from rangesfm.measurements.ranges.readers.units import (
     SLOWEST_S,
-    UNITS_PER_METRE,
     Ask,
     days_before_1970,
     range_unit,
@@ -43,6 +42,7 @@ from rangesfm.measurements.ranges.readers.vocabulary import named_length_unit
 from rangesfm.measurements.ranges.twr import StampOptions, double_sided_range, single_sided_range
 from rangesfm.options import TIME_S, RangesOptions
 from rangesfm.util.files.text_tables import TextTable
+from rangesfm.util.units import UNITS_PER_METRE
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 QUANTITIES = (

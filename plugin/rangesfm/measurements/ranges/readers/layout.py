@@ -23,7 +23,6 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
-from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.measurements.ranges.readers.vocabulary import (
     ANCHOR,
     BIAS,
@@ -39,6 +38,7 @@ from rangesfm.measurements.ranges.readers.vocabulary import (
 from rangesfm.util.files.folders import IMAGE_EXTENSIONS
 from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, num_cells, read_head, read_text
 from rangesfm.util.geometry.reference import QUATERNION_TOLERANCE
+from rangesfm.util.units import UNITS_PER_METRE
 
 _ANGLE = re.compile(
     r"([NSEW]?) ?(-?)(\d{1,3}(?:\.\d+)?) ?(?:°|º|deg) ?(?:(\d{1,2}(?:\.\d+)?) ?['’′])? ?"

@@ -21,7 +21,6 @@ from rangesfm.measurements.ranges.readers.columns import read_timestamps
 from rangesfm.measurements.ranges.readers.guess import described
 from rangesfm.measurements.ranges.readers.layout import MISSING, SHORTEST_M, ColumnSample, Layout, find_layout
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError, columns_typed
-from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
 from rangesfm.option_model import Bounds
 from rangesfm.util.files.text_tables import (
     FOUND,
@@ -33,6 +32,7 @@ from rangesfm.util.files.text_tables import (
     read_head,
     read_table,
 )
+from rangesfm.util.units import UNITS_PER_METRE
 
 AXES = ("x", "y", "z")
 # Largest plausible median time between two photos or positions, in seconds.

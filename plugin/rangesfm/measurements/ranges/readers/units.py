@@ -14,18 +14,7 @@ from rangesfm.measurements.ranges.readers.times import SECONDS_PER_UNIT, unit_by
 from rangesfm.measurements.ranges.readers.unclear import Choice, UnclearFileError
 from rangesfm.measurements.ranges.readers.vocabulary import TIMES, named_length_unit, named_unit, words_of
 from rangesfm.util.files.clock_times import are_seconds_since_1970
-from rangesfm.util.geometry.numerics import FOOT_M
-
-UNITS_PER_METRE = {
-    "m": 1.0,
-    "cm": 100.0,
-    "mm": 1000.0,
-    "dm": 10.0,
-    "km": 1e-3,
-    "ft": 1 / FOOT_M,
-    "in": 12 / FOOT_M,
-    "yd": 1 / (3 * FOOT_M),
-}
+from rangesfm.util.units import UNITS_PER_METRE
 
 _MIN_NUM = 20  # number of values below which the values do not show their unit
 # Smallest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller step means
