@@ -41,10 +41,10 @@ print(f"{estimate.value:.4f} m per unit, 95 % interval {low:.4f} to {high:.4f}, 
 metric, summary = rangesfm.refine_with_ranges(
     rangesfm.rescale(reconstruction, estimate.metric_from_sfm),
     trajectory,
-    estimate.observations,
+    estimate.ranges.observations,
     estimate.metric_from_sfm,
-    estimate.anchors,
-    estimate.errors,
+    estimate.ranges.anchors,
+    estimate.ranges.errors,
     tag_in_cam_m=tag_in_cam_m,
     first_pose_is_fixed=True,
 )

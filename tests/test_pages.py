@@ -19,6 +19,7 @@ import shlex
 import shutil
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -30,7 +31,7 @@ from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.export import EXPORTERS
-from rangesfm.measurements.ranges.readers import reader_names
+from rangesfm.measurements.ranges.readers import read_ranges, reader_names, write_ranges_csv
 from rangesfm.planning.plan_file import plan_tables
 from rangesfm.survey.settings import KEYS
 from rangesfm.survey.survey_reader import read_survey
@@ -96,9 +97,13 @@ def model_folder(
     tag_m = SITE_M + path.centers(times) + path.world_from_cam(times) @ np.array(TAG_IN_CAM_M)
     rows = [",".join(map(repr, row)) for row in np.column_stack([times - TIME_OFFSET_S, tag_m]).tolist()]
     (folder / "tag.csv").write_text("\n".join(["timestamp_s,x_m,y_m,z_m", *rows]) + "\n")
-    flags = ("survey.toml", "--input_path", "sparse/0", "--output_path", "monday/out", "--no_report")
-    rangesfm_command("refine", *flags, cwd=folder)
-    shutil.copytree(folder / "monday", folder / "tuesday")
+    log = read_ranges(folder / "uwb.csv")
+    noise_m = 0.01 * np.random.default_rng(4).standard_normal(len(log))
+    write_ranges_csv(replace(log, range_m=log.range_m + noise_m), folder / "other_uwb.csv")
+    for day, ranges in (("monday", "uwb.csv"), ("tuesday", "other_uwb.csv")):
+        flags = ("survey.toml", "--input_path", "sparse/0", "--ranges", ranges, "--output_path", f"{day}/out")
+        rangesfm_command("refine", *flags, "--no_report", cwd=folder)
+    (folder / "other_uwb.csv").unlink()
     return folder
 
 
