@@ -43,6 +43,10 @@ from rangesfm.survey.settings import Survey
 from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.trajectory import Trajectory
 
+_NO_POSITION_ON_PATH = (
+    "no position is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
+)
+
 
 @dataclass(frozen=True)
 class MapOfPhotos:
@@ -86,11 +90,6 @@ def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
         site=inputs.site,
         seed=survey.output.seed,
     )
-
-
-_NO_POSITION_ON_PATH = (
-    "no position is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
-)
 
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
